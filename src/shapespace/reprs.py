@@ -23,7 +23,7 @@ def short_repr(self: Any) -> str:
     return f"{type(self).__name__}({', '.join(shown_fields)})"
 
 
-def first_names(names: Sequence[object], most: int) -> str:
+def first_names(names: Sequence[object], most: int = 3) -> str:
     """Return the first `most` of `names` with commas; dots stand for the others."""
     return ", ".join(map(str, names[:most])) + (", ..." if len(names) > most else "")
 

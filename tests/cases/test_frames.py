@@ -21,7 +21,7 @@ from shapespace.geometry.normals import rms_size
 from shapespace.geometry.volume_surface import surface_of_volume
 from shapespace.io.landmarks.landmark_io import read_landmarks
 from shapespace.io.meshes.mesh_io import MESH_FORMATS, read_mesh, write_mesh
-from shapespace.io.volumes.volume_io import read_volume
+from shapespace.io.volume_io import read_volume
 from shapespace.types import RAS_TO_LPS, FloatArray, LabelVolume, Mesh, Segment, Similarity
 from synthetic_shapes import blob_model, raw_scan, sphere
 

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from conftest import VERTICES, Run, World, Z
-from shapespace.io.landmarks.fiducials import FIDUCIAL_ENDINGS
-from shapespace.io.landmarks.landmark_io import read_landmarks, write_landmarks
+from shapespace.io.landmarks.landmark_io import FIDUCIAL_ENDINGS, read_landmarks, write_landmarks
 from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray

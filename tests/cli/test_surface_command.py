@@ -152,7 +152,7 @@ def test_the_odd_ones_among_many_are_named(run: Run, tmp_path: Path) -> None:
 
 def test_what_is_missing_is_said_once(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     paths = [nifti(tmp_path / f"{k}.nii") for k in range(2)]
-    monkeypatch.setattr("shapespace.io.volumes.volume_io.find_spec", lambda name: None)
+    monkeypatch.setattr("shapespace.io.volume_io.find_spec", lambda name: None)
     outcome = run("surface", *paths, "-o", tmp_path / "out")
     assert outcome.code == 2 and "pip install 'shapespace[volumes]'" in outcome.sentence()
 

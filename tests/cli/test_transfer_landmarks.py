@@ -9,8 +9,7 @@ import pytest
 from conftest import Run
 from same_blobs import ASIDE, write_same
 from shapespace.geometry.closest import build_engine
-from shapespace.io.landmarks.fiducials import FIDUCIAL_ENDINGS
-from shapespace.io.landmarks.landmark_io import read_landmarks, write_landmarks
+from shapespace.io.landmarks.landmark_io import FIDUCIAL_ENDINGS, read_landmarks, write_landmarks
 from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.types import FloatArray
 

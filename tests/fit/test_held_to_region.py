@@ -9,7 +9,7 @@ import pytest
 from shapespace.errors import FileFormatError, FitError, InputError, ModelFileError
 from shapespace.fit.fit_scan import FitConfig, FitResult, fit_scan
 from shapespace.fit.iteration_state import UNSEEN
-from shapespace.io.meshes.region_files import read_region
+from shapespace.io.landmarks.landmark_io import read_region
 from shapespace.model.region import Part
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh

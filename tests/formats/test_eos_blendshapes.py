@@ -8,7 +8,7 @@ import pytest
 
 from shapespace.commands.convert import convert
 from shapespace.errors import InputError, ModelFileError
-from shapespace.formats.eos import Eos, read_blendshapes
+from shapespace.formats.eos import read_blendshapes, write_eos
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
 from synthetic_shapes import blob_model
@@ -27,7 +27,7 @@ def blendshapes(path: Path, moved: np.ndarray, names: list[str]) -> Path:
 @pytest.fixture
 def model(tmp_path: Path) -> ShapeModel:
     whole = blob_model(300)
-    Eos().write(whole.as_linear(), tmp_path / "shape.bin")
+    write_eos(whole.as_linear(), tmp_path / "shape.bin")
     return whole
 
 

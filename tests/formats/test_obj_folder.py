@@ -9,7 +9,7 @@ import pytest
 
 from shapespace.errors import InputError, ModelFileError
 from shapespace.formats.model_parts import Modes
-from shapespace.formats.obj_folder import ObjFolder
+from shapespace.formats.obj_folder import read_obj_folder, write_obj_folder
 from shapespace.formats.registry import is_known
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
@@ -40,7 +40,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_the_layout_of_ict_facekit_is_an_additive_model_in_cm(folder: Path) -> None:
     (folder / "LICENSE").write_text("\nMIT License\n\nCopyright\n")
-    found = ObjFolder().read(folder)
+    found = read_obj_folder(folder)
     assert found.expression is not None and found.mm == 10
     assert found.shape.names == ("identity000", "identity001") and found.expression.names == ("browUp_L", "jawOpen")
     assert np.array_equal(found.mean, QUAD) and found.licence == "MIT License"
@@ -54,7 +54,7 @@ def test_a_neutral_and_shapes_of_any_name_are_one_block_in_mm(folder: Path) -> N
     (folder / "generic_neutral_mesh.obj").rename(folder / "Neutral.obj")
     for name in ("identity000", "identity001"):
         (folder / f"{name}.obj").unlink()
-    found = ObjFolder().read(folder)
+    found = read_obj_folder(folder)
     assert found.expression is None and found.mm is None and found.shape.names == ("browUp_L", "jawOpen")
     assert any("one standard deviation" in note for note in found.notes)
 
@@ -83,7 +83,7 @@ def test_shapes_of_another_topology_are_refused_by_name(folder: Path) -> None:
     obj(folder / "jawOpen.obj", QUAD, (0, 1, 3, 2))
     assert is_known(folder)
     with pytest.raises(ModelFileError, match=r"jawOpen\.obj has other vertices or triangles than generic_neutral"):
-        ObjFolder().read(folder)
+        read_obj_folder(folder)
 
 
 def test_what_is_written_says_mm_and_keeps_names_and_facts(tmp_path: Path) -> None:
@@ -94,16 +94,16 @@ def test_what_is_written_says_mm_and_keeps_names_and_facts(tmp_path: Path) -> No
         linear, shape=Modes(moved[:, :2]), expression=Modes(moved[:, 2:4], ("jaw open", "smile"))
     )
     path = tmp_path / "new" / "face"
-    ObjFolder().write(parted, path)
+    write_obj_folder(parted, path)
     assert sorted(p.name for p in path.iterdir()) == [
         "generic_neutral_mesh.obj", "identity000.obj", "identity001.obj", "jaw open.obj", "shapespace.json",
         "smile.obj",
     ]  # fmt: skip
-    again = ObjFolder().read(path)
+    again = read_obj_folder(path)
     assert again.mm == 1 and again.n_training == 41 and dict(again.landmarks) == {"tip": 7}
     assert np.array_equal(again.mean, linear.mean)
     with pytest.raises(InputError, match="is there already"):
-        ObjFolder().write(parted, path)
+        write_obj_folder(parted, path)
 
 
 def test_names_that_are_no_file_names_do_not_become_any(tmp_path: Path) -> None:
@@ -111,7 +111,7 @@ def test_names_that_are_no_file_names_do_not_become_any(tmp_path: Path) -> None:
     for names in (("../up", "b"), ("same", "Same"), ("neutral", "b"), ("identity1", "b")):
         block = Modes(linear.shape.moved[:, :2], names)
         path = tmp_path / f"of {len(list(tmp_path.iterdir()))}"
-        ObjFolder().write(dataclasses.replace(linear, expression=block), path)
+        write_obj_folder(dataclasses.replace(linear, expression=block), path)
         assert {"expression000.obj", "expression001.obj"} <= {p.name for p in path.iterdir()}
 
 
@@ -120,6 +120,6 @@ def test_the_published_files_are_read(tmp_path: Path) -> None:
     assert is_known(ICT)
     for name in ("generic_neutral_mesh", "identity000", "jawOpen"):
         (tmp_path / f"{name}.obj").symlink_to(ICT / f"{name}.obj")
-    found = ObjFolder().read(tmp_path)
+    found = read_obj_folder(tmp_path)
     assert found.mean.shape == (26719, 3)
     assert found.expression is not None and "jawOpen" in found.expression.names

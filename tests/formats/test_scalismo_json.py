@@ -13,7 +13,7 @@ from statismo_by_hand import truth
 from own_file_fuzz import damaged_bytes, damaged_json, fuzzed
 from shapespace.errors import ModelFileError, ShapespaceError
 from shapespace.formats.model_parts import LinearModel, Modes
-from shapespace.formats.scalismo_json import ScalismoJson
+from shapespace.formats.scalismo_json import write_scalismo_json
 from shapespace.model.shape_model import ShapeModel
 
 FLOAT = {"class": "H5T_FLOAT", "base": "H5T_IEEE_F32LE"}
@@ -77,7 +77,7 @@ def test_a_file_of_scalismo_gives_the_model_whatever_it_is_named(listed: bool, n
 def test_what_we_write_has_all_that_scalismo_asks_for(tmp_path: Path) -> None:
     one = truth()
     linear = LinearModel(mean=one.mean, shape=Modes(one.basis * np.sqrt(one.variance)), faces=one.faces)
-    ScalismoJson().write(linear, tmp_path / "m.h5.json")
+    write_scalismo_json(linear, tmp_path / "m.h5.json")
     file = json.loads((tmp_path / "m.h5.json").read_text())
     assert file.keys() == {"apiVersion", "root", "groups", "datasets"}
     found: dict[str, Any] = {}

@@ -16,7 +16,7 @@ from shapespace.commands.convert import convert
 from shapespace.errors import ModelFileError
 from shapespace.formats.model_parts import LinearModel, Modes
 from shapespace.formats.registry import read_linear
-from shapespace.formats.statismo import Statismo
+from shapespace.formats.statismo import write_statismo
 from shapespace.io import sandbox_child
 from shapespace.model.additive import AdditiveModel
 from shapespace.model.shape_model import ShapeModel
@@ -206,7 +206,7 @@ def one_of(additive: bool) -> LinearModel:
 
 @pytest.mark.parametrize("additive", [False, True], ids=["plain", "momo"])
 def test_what_we_write_is_laid_out_as_scalismo_and_statismo_ask(additive: bool, tmp_path: Path) -> None:
-    Statismo().write(one_of(additive), tmp_path / "m.h5")
+    write_statismo(one_of(additive), tmp_path / "m.h5")
     with h5py.File(tmp_path / "m.h5") as file:
         f: Any = file
         roots = ["shape/", "color/", "expression/"] if additive else [""]

@@ -31,8 +31,8 @@ from shapespace.batch.fit_records import (
 )
 from shapespace.errors import FileFormatError, ModelFileError, ShapespaceError
 from shapespace.fit.fit_scan import FitConfig, fit_scan
-from shapespace.formats.flame import Flame
-from shapespace.formats.gias import Gias
+from shapespace.formats.face_models import read_flame
+from shapespace.formats.gias_monai import read_gias
 from shapespace.model.shape_model import ShapeModel
 from shapespace.recognise.classifier_file import FACTS, SavedClassifier, load_classifier, software_versions
 from shapespace.recognise.classifiers import CLASSIFIERS
@@ -299,8 +299,8 @@ def test_headers_of_arrays_that_declare_anything_are_taken_or_refused(home: Path
     (tmp_path / "one.fit.json").write_bytes((home / "one.fit.json").read_bytes())
     (tmp_path / "one.stages.npz").write_bytes((home / "one.stages.npz").read_bytes())
     readers: dict[str, Callable[[], object]] = {
-        "smpl.npz": lambda: Flame().read(tmp_path / "smpl.npz"),
-        "a.pc.npz": lambda: Gias().read(tmp_path / "a.pc.npz"),
+        "smpl.npz": lambda: read_flame(tmp_path / "smpl.npz"),
+        "a.pc.npz": lambda: read_gias(tmp_path / "a.pc.npz"),
         "age.npz": lambda: Predictor.load(tmp_path / "age.npz"),
         "one.stages.npz": lambda: staged(tmp_path),
     }

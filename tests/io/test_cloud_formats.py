@@ -14,8 +14,7 @@ from refusals import refusal_of
 from shapespace.commands.look import check
 from shapespace.errors import FileFormatError
 from shapespace.io import read_limits as limits
-from shapespace.io.meshes.mesh_folders import mesh_files
-from shapespace.io.meshes.mesh_io import MESH_ENDINGS, ending_of, probe_mesh, read_mesh, stem_of, write_mesh
+from shapespace.io.meshes.mesh_io import MESH_ENDINGS, ending_of, mesh_files, probe_mesh, read_mesh, stem_of, write_mesh
 from shapespace.types import Mesh
 
 POINTS = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32).astype(np.float64)

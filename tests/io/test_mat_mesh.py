@@ -7,8 +7,7 @@ import numpy as np
 from scipy.io import savemat
 
 from refusals import refusal_of
-from shapespace.io.meshes.mesh_folders import mesh_files
-from shapespace.io.meshes.mesh_io import MESH_ENDINGS, NAMED_FORMATS, read_mesh, write_mesh
+from shapespace.io.meshes.mesh_io import MESH_ENDINGS, NAMED_FORMATS, mesh_files, read_mesh, write_mesh
 from shapespace.types import Mesh
 
 VERTICES = np.random.default_rng(0).normal(size=(9, 3))

@@ -18,8 +18,7 @@ from shapespace.batch.fit_records import read_record
 from shapespace.batch.result_folder import records_in
 from shapespace.cohort.labels import read_labels
 from shapespace.errors import FileError, FileFormatError
-from shapespace.io.containers.archives import read_arrays
-from shapespace.io.containers.arrays import read_arrays as kept_arrays
+from shapespace.io.containers.archives import kept_arrays, read_arrays
 from shapespace.io.containers.json_files import plain_json, read_json
 from shapespace.model.shape_model import ShapeModel
 from shapespace.recognise.classifier_file import load_classifier

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from shapespace.cli import main
-from shapespace.formats.facts import write_folder
-from shapespace.io.containers.arrays import write_arrays
+from shapespace.formats.model_parts import write_folder
+from shapespace.io.containers.archives import write_arrays
 from shapespace.io.files import atomic_path, sweep, temporary_folder, write_bytes, write_text, write_together
 from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.types import Mesh

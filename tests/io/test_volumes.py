@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from shapespace.errors import FileError, FileFormatError, InputError, ShapespaceError
-from shapespace.io.volumes.volume_io import read_volume, volume_name
+from shapespace.io.volume_io import read_volume, volume_name
 from shapespace.types import LabelVolume
 
 nib = pytest.importorskip("nibabel", reason="the extra `volumes` is not installed")
@@ -211,6 +211,8 @@ BAD: dict[str, tuple[Callable[[Path], Path], str]] = {
     "checksum, mha zlib": (lambda d: _flip(write_meta(d / "a.mha", packed=True), -1), "or are wrong"),
     "mhd elsewhere": (lambda d: _put(d / "a.mhd", META.replace(b"LOCAL", b"../a.raw")), "in one file in its folder"),
     "mhd in slices": (lambda d: _put(d / "a.mhd", META.replace(b"LOCAL", b"LIST")), "not in one file in its folder"),
+    "mhd with a zero": (lambda d: _put(d / "a.mhd", META.replace(b"LOCAL", b"a\0.raw")), "in one file in its folder"),
+    "mhd alone": (lambda d: _put(d / "a.mhd", META.replace(b"LOCAL", b"b.raw")), "'b.raw' is not in its folder"),
     "mhd without data": (lambda d: _put(d / "a.mhd", META.replace(b"LOCAL", b"a.mhd")), "more than the file can hold"),
     "mha of vectors": (lambda d: _put(d / "a.mha", b"ElementNumberOfChannels = 3\n" + META), "several values"),
     "mha without spacing": (lambda d: _put(d / "a.mha", META.replace(b"Spacing", b"Space")), "how large a voxel is"),
@@ -380,7 +382,7 @@ def test_damage_ends_in_a_volume_or_in_a_sentence(name: str, data: st.DataObject
 
 
 def test_the_sentence_says_how_to_get_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shapespace.io.volumes.volume_io.find_spec", lambda name: None)
+    monkeypatch.setattr("shapespace.io.volume_io.find_spec", lambda name: None)
     with pytest.raises(ShapespaceError, match=r"pip install 'shapespace\[volumes\]'"):
         read_volume(write_nifti(tmp_path / "a.nii"))
 

@@ -35,8 +35,7 @@ from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.iteration_state import IcpState
 from shapespace.fit.result import FitResult
 from shapespace.io.files import make_folder, sha256_of_file, write_text, write_together
-from shapespace.io.landmarks.fiducials import FIDUCIAL_ENDINGS, fiducial_texts
-from shapespace.io.landmarks.landmark_io import read_landmarks
+from shapespace.io.landmarks.landmark_io import FIDUCIAL_ENDINGS, fiducial_texts, read_landmarks
 from shapespace.io.memory_cache import LatestValue
 from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.io.read_limits import LARGEST_MESH_FILE_BYTES

@@ -19,8 +19,7 @@ from shapespace.correspondence.registration import (
 )
 from shapespace.correspondence.template import PoseModel
 from shapespace.errors import FileError
-from shapespace.io.containers.archives import read_arrays
-from shapespace.io.containers.arrays import write_arrays
+from shapespace.io.containers.archives import read_arrays, write_arrays
 from shapespace.io.containers.hdf5 import content_hash
 from shapespace.io.files import make_folder
 from shapespace.types import Similarity

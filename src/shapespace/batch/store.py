@@ -17,7 +17,7 @@ import numpy as np
 
 from shapespace.errors import FileFormatError, ShapespaceError
 from shapespace.io.files import atomic_path, make_folder, remove_file, sha256_of_file, sweep, write_error
-from shapespace.io.landmarks.fiducials import FIDUCIAL_ENDINGS
+from shapespace.io.landmarks.landmark_io import FIDUCIAL_ENDINGS
 from shapespace.io.tables.table_io import CHECKSUM
 from shapespace.schemas import FitRecord
 from shapespace.store import results as reading

@@ -162,7 +162,7 @@ def answer_asymmetry(arguments: argparse.Namespace) -> Outcome:
 
 def answer_change(arguments: argparse.Namespace) -> Outcome:
     """Measure the changes, and write the report."""
-    from shapespace.io.meshes.region_files import read_region
+    from shapespace.io.landmarks.landmark_io import read_region
     from shapespace.report.analyses.change_report import change_report
     from shapespace.statistics.change_result import ChangeConfig
     from shapespace.statistics.measure_change import change

@@ -24,8 +24,7 @@ from shapespace.errors import InputError, ShapespaceError
 from shapespace.geometry.landmark_placement import far_landmarks, landmarks_in_frame_of, place_landmarks
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.files import make_folder, read_error
-from shapespace.io.landmarks.landmark_io import is_of_vertices, read_landmarks, read_surface_landmarks
-from shapespace.io.meshes.region_files import read_region
+from shapespace.io.landmarks.landmark_io import is_of_vertices, read_landmarks, read_region, read_surface_landmarks
 from shapespace.model.build_model import BuildConfig, build_model, extend_model
 from shapespace.model.missing import MIN_SEEN, ObservedMeshes
 from shapespace.model.representation import representation_named

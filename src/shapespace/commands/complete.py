@@ -14,7 +14,7 @@ from shapespace.commands.fit import landmark_files, scan_jobs
 from shapespace.commands.inputs import given_scans
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.fit.completion.complete import Completion, CompletionConfig, complete, refine_surface
-from shapespace.io.containers.arrays import write_arrays
+from shapespace.io.containers.archives import write_arrays
 from shapespace.io.files import make_folder, remove_file
 from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel

@@ -19,8 +19,8 @@ from shapespace.commands.outcome import Outcome, exit_code_of
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.io.files import atomic_path, make_folder, write_bytes, write_error, write_text
 from shapespace.io.landmarks.configuration_io import CONFIGURATION_FORMATS, write_configurations
-from shapespace.io.landmarks.fiducials import fiducial_texts
 from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations
+from shapespace.io.landmarks.landmark_io import fiducial_texts
 from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.io.tables.table_io import CHECKSUM, write_checked, write_rows
 from shapespace.schemas import to_json

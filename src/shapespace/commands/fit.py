@@ -27,9 +27,8 @@ from shapespace.fit.iteration_state import IcpState
 from shapespace.fit.method_choices import method_named
 from shapespace.geometry.doctor import NON_FINITE
 from shapespace.io.files import make_folder, read_bytes, remove_file, write_bytes, write_text
-from shapespace.io.landmarks.fiducials import FIDUCIAL_ENDINGS
+from shapespace.io.landmarks.landmark_io import FIDUCIAL_ENDINGS, read_region
 from shapespace.io.meshes.mesh_io import probe_mesh, read_mesh, stem_of
-from shapespace.io.meshes.region_files import read_region
 from shapespace.io.remote import is_address
 from shapespace.io.tables.table_io import table_rows, table_text
 from shapespace.model.shape_model import ShapeModel

@@ -16,10 +16,8 @@ from shapespace.errors import FileError, InputError, MeshError, ShapespaceError
 from shapespace.geometry.normals import without_estimates
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import read_bytes
-from shapespace.io.landmarks.fiducials import FIDUCIAL_ENDINGS
-from shapespace.io.landmarks.landmark_io import LANDMARK_FORMATS, READ_ONLY_LANDMARKS, read_landmarks
-from shapespace.io.meshes.mesh_folders import mesh_files
-from shapespace.io.meshes.mesh_io import MESH_FILE_ENDINGS, stem_of
+from shapespace.io.landmarks.landmark_io import FIDUCIAL_ENDINGS, LANDMARK_FORMATS, READ_ONLY_LANDMARKS, read_landmarks
+from shapespace.io.meshes.mesh_io import MESH_FILE_ENDINGS, mesh_files, stem_of
 from shapespace.io.remote import addresses, is_address
 from shapespace.io.tables.table_io import decoded_text, key_column, table_rows
 from shapespace.reprs import first_names

@@ -23,8 +23,7 @@ from shapespace.geometry.landmark_placement import landmarks_in_frame_of, place_
 from shapespace.geometry.normals import rms_size
 from shapespace.io.files import make_folder, write_text
 from shapespace.io.landmarks.configuration_io import CURVE_SLIDERS, SURFACE_SLIDERS
-from shapespace.io.landmarks.fiducials import point_texts
-from shapespace.io.landmarks.landmark_io import read_landmarks, surface_landmark_cells
+from shapespace.io.landmarks.landmark_io import point_texts, read_landmarks, surface_landmark_cells
 from shapespace.io.landmarks.tps_nts import tps_text
 from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.io.remote import is_address

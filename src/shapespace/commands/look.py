@@ -18,8 +18,7 @@ from shapespace.geometry.doctor import examine, examine_and_repair
 from shapespace.geometry.mirror_plane import mirror_image
 from shapespace.geometry.normals import faces_of
 from shapespace.io.files import make_folder, remove_file
-from shapespace.io.meshes.mesh_folders import mesh_files
-from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
+from shapespace.io.meshes.mesh_io import mesh_files, read_mesh, write_mesh
 from shapespace.model.additive import load_model
 from shapespace.model.foreign import looks_like_model
 from shapespace.model.shape_model import ShapeModel

@@ -17,8 +17,7 @@ from shapespace.commands.outcome import Outcome
 from shapespace.errors import FitError, InputError, MeshError
 from shapespace.geometry.procrustes import Gauge
 from shapespace.io.files import make_folder, write_text
-from shapespace.io.meshes.mesh_folders import mesh_files
-from shapespace.io.meshes.mesh_io import read_mesh
+from shapespace.io.meshes.mesh_io import mesh_files, read_mesh
 from shapespace.model.foreign import looks_like_model
 from shapespace.model.model_quality import Curve, ModelQuality, Part, QualityConfig, Runner, Shapes, measure_quality
 from shapespace.model.representation import representation_named

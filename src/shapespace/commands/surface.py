@@ -17,9 +17,8 @@ from shapespace.errors import ShapespaceError
 from shapespace.geometry.volume_surface import SMOOTH, VolumeSurface, surface_of_volume
 from shapespace.io.files import make_folder, remove_file
 from shapespace.io.memory_cache import available_bytes
-from shapespace.io.meshes.mesh_folders import mesh_files
-from shapespace.io.meshes.mesh_io import write_mesh
-from shapespace.io.volumes.volume_io import VOLUME_ENDINGS, read_volume, require_volumes_extra, volume_name
+from shapespace.io.meshes.mesh_io import mesh_files, write_mesh
+from shapespace.io.volume_io import VOLUME_ENDINGS, read_volume, require_volumes_extra, volume_name
 from shapespace.types import MAX_MEMORY_BYTES
 
 _MANY = 4  # surfaces; a median of fewer does not show what is usual

@@ -20,7 +20,7 @@ from shapespace.datasets.simulated_scan import random_similarity
 from shapespace.errors import InputError
 from shapespace.io.files import make_folder, write_bytes
 from shapespace.io.meshes.mesh_io import write_mesh
-from shapespace.io.volumes.volume_io import require_volumes_extra
+from shapespace.io.volume_io import require_volumes_extra
 from shapespace.types import FloatArray, LabelVolume, Mesh
 
 _HALF_MM = np.array([55.0, 34.0, 19.0])

@@ -28,59 +28,53 @@ _SFM_LICENCE = "Surrey Face Model (3448): non-commercial use only, see its READM
 Item = TypeVar("Item")
 
 
-class Eos:
-    """`eos.morphablemodel`: shape, colour, expressions of PCA or blendshapes; versions 1 to 4."""
+def is_eos(path: Path, head: bytes) -> bool:
+    """Whether it begins with a version of eos and a mean of one column."""
+    if path.suffix.lower() != ".bin" or len(head) < 12:
+        return False
+    version, rows, columns = struct.unpack_from("<Iii", head)
+    if 1 <= version <= _NEWEST and rows > 0 and rows % 3 == 0 and columns == 1:
+        return True
+    return _are_blendshapes(head)
 
-    name = "eos"
-    title = "eos .bin"
-    suffixes: Sequence[str] = (".bin",)
 
-    def recognises(self, path: Path, head: bytes) -> bool:
-        """Whether it begins with a version of eos and a mean of one column."""
-        if path.suffix.lower() != ".bin" or len(head) < 12:
-            return False
-        version, rows, columns = struct.unpack_from("<Iii", head)
-        if 1 <= version <= _NEWEST and rows > 0 and rows % 3 == 0 and columns == 1:
-            return True
-        return _are_blendshapes(head)
+def read_eos(path: Path) -> LinearModel:
+    """Read `eos.morphablemodel`: shape, colour, expressions of PCA or blendshapes; versions 1 to 4."""
+    check_file(path, _LARGEST_BYTES, _AGAIN)
+    data = read_bytes(path)
+    if _are_blendshapes(data[:16]):
+        raise ModelFileError(
+            f"{path} holds the blendshapes of an eos model, without the model; give that, and this with --expressions."
+        )
+    try:
+        return _model(_Archive(data))
+    except (_DamagedError, ValueError, OverflowError) as error:
+        raise ModelFileError(f"{path} is damaged, or no model of eos: {error}; {_AGAIN}.") from error
 
-    def read(self, path: Path) -> LinearModel:
-        """As `ModelReader.read`."""
-        check_file(path, _LARGEST_BYTES, _AGAIN)
-        data = read_bytes(path)
-        if _are_blendshapes(data[:16]):
-            raise ModelFileError(
-                f"{path} holds the blendshapes of an eos model, without the model; give that, and this with "
-                "--expressions."
-            )
-        try:
-            return _model(_Archive(data))
-        except (_DamagedError, ValueError, OverflowError) as error:
-            raise ModelFileError(f"{path} is damaged, or no model of eos: {error}; {_AGAIN}.") from error
 
-    def write(self, model: LinearModel, path: Path) -> Sequence[str]:
-        """As `ModelFormat.write`; single precision, version 4."""
-        out = bytearray(struct.pack("<I", _NEWEST))
-        out += _pca_bytes(model.mean.ravel(), model.shape.moved, model)
-        out += _pca_bytes(_NOTHING, _NOTHING, None)
-        if model.expression is None:
-            out += struct.pack("<B", 1)
-        else:
-            zero = np.zeros(model.mean.size)
-            out += struct.pack("<Bi", 0, _PCA) + _pca_bytes(zero, model.expression.moved, model)
-        if model.landmarks:
-            out += struct.pack("<BQ", 0, len(model.landmarks))
-            for name in sorted(model.landmarks):
-                text = name.encode()
-                out += struct.pack("<Q", len(text)) + text + struct.pack("<i", model.landmarks[name])
-        else:
-            out += struct.pack("<B", 1)
-        out += struct.pack("<QQ", 0, 0)
-        write_bytes(path, bytes(out))
-        notes = ["Numbers are in single precision.", *_moved_landmarks(model)]
-        if model.provenance or model.licence:
-            notes.append("Provenance and licence are left out: eos has no place for them.")
-        return notes
+def write_eos(model: LinearModel, path: Path) -> Sequence[str]:
+    """As `ModelFormat.write`; single precision, version 4."""
+    out = bytearray(struct.pack("<I", _NEWEST))
+    out += _pca_bytes(model.mean.ravel(), model.shape.moved, model)
+    out += _pca_bytes(_NOTHING, _NOTHING, None)
+    if model.expression is None:
+        out += struct.pack("<B", 1)
+    else:
+        zero = np.zeros(model.mean.size)
+        out += struct.pack("<Bi", 0, _PCA) + _pca_bytes(zero, model.expression.moved, model)
+    if model.landmarks:
+        out += struct.pack("<BQ", 0, len(model.landmarks))
+        for name in sorted(model.landmarks):
+            text = name.encode()
+            out += struct.pack("<Q", len(text)) + text + struct.pack("<i", model.landmarks[name])
+    else:
+        out += struct.pack("<B", 1)
+    out += struct.pack("<QQ", 0, 0)
+    write_bytes(path, bytes(out))
+    notes = ["Numbers are in single precision.", *_moved_landmarks(model)]
+    if model.provenance or model.licence:
+        notes.append("Provenance and licence are left out: eos has no place for them.")
+    return notes
 
 
 def _moved_landmarks(model: LinearModel) -> list[str]:
@@ -106,18 +100,14 @@ def read_blendshapes(path: Path) -> Modes:
     archive = _Archive(read_bytes(path))
     try:
         with np.errstate(invalid="ignore"):
-            blendshapes = archive.many(lambda: (archive.text(), archive.matrix().ravel()), 16)
+            names, displacements = archive.blendshapes()
         if not archive.at_end:
             raise _DamagedError("there is more in it than blendshapes")
-        if not blendshapes or any(
-            len(displacements) != len(blendshapes[0][1]) or len(displacements) % 3 for _, displacements in blendshapes
-        ):
+        if len(set(map(len, displacements))) != 1 or len(displacements[0]) % 3:
             raise _DamagedError("they have different numbers of vertices")
     except (_DamagedError, ValueError, OverflowError) as error:
         raise ModelFileError(f"{path} holds no blendshapes of eos: {error}; {_BLENDSHAPES_AGAIN}.") from error
-    return Modes(
-        np.stack([displacements for _, displacements in blendshapes], axis=1), tuple(name for name, _ in blendshapes)
-    )
+    return Modes(np.stack(displacements, axis=1), names)
 
 
 def _are_blendshapes(head: bytes) -> bool:
@@ -169,6 +159,11 @@ class _Archive:
         if count * least_bytes > len(self._data) - self._at:
             raise _DamagedError("it is cut short")
         return [read_item() for _ in range(count)]
+
+    def blendshapes(self) -> tuple[tuple[str, ...], list[FloatArray]]:
+        """Return their names and displacements (D,)."""
+        pairs = self.many(lambda: (self.text(), self.matrix().ravel()), 16)
+        return tuple(name for name, _ in pairs), [displacements for _, displacements in pairs]
 
     def _take(self, size: int) -> bytes:
         if size > len(self._data) - self._at:
@@ -231,12 +226,10 @@ def _expression(archive: _Archive, size: int) -> tuple[Modes, FloatArray]:
         return Modes(displacements), mean_displacement
     if kind != _BLENDSHAPES:
         raise _DamagedError(f"there is no kind {kind} of expressions")
-    blendshapes = archive.many(lambda: (archive.text(), archive.matrix().ravel()), 16)
-    if not blendshapes or any(len(displacements) != size for _, displacements in blendshapes):
+    names, blendshapes = archive.blendshapes()
+    if not blendshapes or any(len(displacements) != size for displacements in blendshapes):
         raise _DamagedError("blendshapes have another number of vertices")
-    return Modes(
-        np.stack([displacements for _, displacements in blendshapes], axis=1), tuple(name for name, _ in blendshapes)
-    ), np.zeros(size)
+    return Modes(np.stack(blendshapes, axis=1), names), np.zeros(size)
 
 
 def _pca_bytes(mean: FloatArray, displacements: FloatArray, model: LinearModel | None) -> bytes:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import mmap
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -11,85 +10,83 @@ from typing import Any, Final
 import numpy as np
 
 from shapespace.errors import InputError
-from shapespace.formats.facts import KEY, facts_of, json_object, with_facts
-from shapespace.formats.model_parts import LinearModel, Modes
+from shapespace.formats.model_parts import IDENTITY, KEY, LinearModel, facts_of, json_object, split_modes, with_facts
 from shapespace.geometry.normals import vertex_normals
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import read_bytes, write_bytes
-from shapespace.io.meshes.gltf_mesh import GltfBuffer, Morphs, centre_if_far, glb_bytes, gltf_bytes, read_morphs
+from shapespace.io.meshes.gltf_mesh import GltfBuffer, centre_if_far, glb_bytes, gltf_bytes, read_morphs
 from shapespace.io.read_limits import LARGEST_MESH_FILE_BYTES
 from shapespace.types import FloatArray, IntArray, Mesh
 
 _MM: Final = 1000.0
 """In one unit of glTF, which is a metre."""
+_SUFFIXES = (".glb", ".gltf")
 _AGAIN = "export it again"
 _TARGETS = b'"targets"'
 _POINT_CLOUD, _SURFACE = 0, 4  # glTF 2.0 primitive.mode: POINTS, TRIANGLES
-_IDENTITY = re.compile(r"identity[ _.-]?\d+", re.IGNORECASE)
 
 
-class Gltf:
-    """A mesh with morph targets, `.glb` or `.gltf`: a weight of one is one standard deviation."""
+def is_gltf_model(path: Path, head: bytes) -> bool:
+    """Whether it is glTF and speaks of morph targets."""
+    if path.suffix.lower() not in _SUFFIXES or not path.is_file():
+        return False
+    try:
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+            if head[:4] == b"glTF":
+                return content.find(_TARGETS, 20, 20 + int.from_bytes(head[12:16], "little")) >= 0
+            return content.find(_TARGETS) >= 0
+    except (OSError, ValueError):
+        return False
 
-    name = "gltf"
-    title = "glTF morph targets"
-    suffixes: Sequence[str] = (".glb", ".gltf")
 
-    def recognises(self, path: Path, head: bytes) -> bool:
-        """Whether it is glTF and speaks of morph targets."""
-        if path.suffix.lower() not in self.suffixes or not path.is_file():
-            return False
-        try:
-            with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-                if head[:4] == b"glTF":
-                    return content.find(_TARGETS, 20, 20 + int.from_bytes(head[12:16], "little")) >= 0
-                return content.find(_TARGETS) >= 0
-        except (OSError, ValueError):
-            return False
+def read_gltf_model(path: Path) -> LinearModel:
+    """Read a mesh with morph targets, `.glb` or `.gltf`: a weight of one is one standard deviation."""
+    check_file(path, LARGEST_MESH_FILE_BYTES, _AGAIN)
+    morphs = read_morphs(read_bytes(path, LARGEST_MESH_FILE_BYTES), path)
+    facts = json_object(json_object(morphs.extras).get(KEY))
+    mean, faces = morphs.vertices, None if morphs.faces is None else morphs.faces.astype(np.int32)
+    displacements = morphs.targets.reshape(len(morphs.targets), -1).T
+    notes: list[str] = []
+    if facts.get("vertices") != len(mean):
+        mean, displacements, faces, merged = _without_seams(mean, displacements, faces)
+        if merged:
+            notes.append(f"{merged} vertices that lie and move with another, as seams have them, are joined to it.")
+    if morphs.n_others:
+        notes.append(f"{morphs.n_others} more meshes of the scene are left out.")
+    if any(morphs.weights):
+        notes.append("Its weights are not zero; the mean is the shape without them.")
+    if not facts:
+        notes.append("A weight of one is taken as one standard deviation.")
+    n_identity = facts.get("n_identity")
+    is_identity = [bool(IDENTITY.fullmatch(name)) for name in morphs.names]
+    if not morphs.names and isinstance(n_identity, int):
+        is_identity = [k < n_identity for k in range(displacements.shape[1])]
+    shape, expression = split_modes(displacements, morphs.names, is_identity)
+    return with_facts(
+        LinearModel(
+            mean=mean,
+            shape=shape,
+            expression=expression,
+            faces=faces,
+            mm=_MM,
+            licence=morphs.copyright,
+            notes=tuple(notes),
+        ),
+        facts,
+    )
 
-    def read(self, path: Path) -> LinearModel:
-        """As `ModelReader.read`."""
-        check_file(path, LARGEST_MESH_FILE_BYTES, _AGAIN)
-        morphs = read_morphs(read_bytes(path, LARGEST_MESH_FILE_BYTES), path)
-        facts = json_object(json_object(morphs.extras).get(KEY))
-        mean, faces = morphs.vertices, None if morphs.faces is None else morphs.faces.astype(np.int32)
-        displacements = morphs.targets.reshape(len(morphs.targets), -1).T
-        notes: list[str] = []
-        if facts.get("vertices") != len(mean):
-            mean, displacements, faces, merged = _without_seams(mean, displacements, faces)
-            if merged:
-                notes.append(f"{merged} vertices that lie and move with another, as seams have them, are joined to it.")
-        if morphs.n_others:
-            notes.append(f"{morphs.n_others} more meshes of the scene are left out.")
-        if any(morphs.weights):
-            notes.append("Its weights are not zero; the mean is the shape without them.")
-        if not facts:
-            notes.append("A weight of one is taken as one standard deviation.")
-        shape, expression = _split_identity(displacements, morphs, facts.get("n_identity"))
-        return with_facts(
-            LinearModel(
-                mean=mean,
-                shape=shape,
-                expression=expression,
-                faces=faces,
-                mm=_MM,
-                licence=morphs.copyright,
-                notes=tuple(notes),
-            ),
-            facts,
-        )
 
-    def write(self, model: LinearModel, path: Path) -> Sequence[str]:
-        """As `ModelFormat.write`; single precision, metres, normals of mean and targets."""
-        tree, binary = _content(model, path)
-        write_bytes(path, (gltf_bytes if path.suffix.lower() == ".gltf" else glb_bytes)(tree, binary))
-        notes = [
-            "Lengths are in metres, as glTF demands, and numbers in single precision.",
-            "A weight of one is one standard deviation; weights run both ways, so widen the sliders to -3 to 3.",
-        ]
-        if model.faces is None:
-            notes.append("It is a point model, so there are no normals.")
-        return notes
+def write_gltf_model(model: LinearModel, path: Path) -> Sequence[str]:
+    """As `ModelFormat.write`; single precision, metres, normals of mean and targets."""
+    tree, binary = _content(model, path)
+    write_bytes(path, (gltf_bytes if path.suffix.lower() == ".gltf" else glb_bytes)(tree, binary))
+    notes = [
+        "Lengths are in metres, as glTF demands, and numbers in single precision.",
+        "A weight of one is one standard deviation; weights run both ways, so widen the sliders to -3 to 3.",
+    ]
+    if model.faces is None:
+        notes.append("It is a point model, so there are no normals.")
+    return notes
 
 
 def _without_seams(
@@ -118,19 +115,6 @@ def _without_seams(
     return mean[kept_rows], columns, joined_faces[~flat], n - len(kept_rows)
 
 
-def _split_identity(displacements: FloatArray, morphs: Morphs, n_identity: object) -> tuple[Modes, Modes | None]:
-    """Return the modes of identity and of expression, or all of them and None."""
-    k = displacements.shape[1]
-    identity = [bool(_IDENTITY.fullmatch(name)) for name in morphs.names]
-    if not identity and isinstance(n_identity, int):
-        identity = [number < n_identity for number in range(k)]
-    if not 0 < sum(identity) < k:
-        return Modes(displacements, morphs.names), None
-    chosen = [[number for number in range(k) if identity[number] is part] for part in (True, False)]
-    names = [tuple(morphs.names[number] for number in part) if morphs.names else () for part in chosen]
-    return Modes(displacements[:, chosen[0]], names[0]), Modes(displacements[:, chosen[1]], names[1])
-
-
 def target_names(model: LinearModel) -> list[str]:
     """Return a name for each mode, those of identity before those of expression."""
     if model.expression is None:
@@ -143,11 +127,9 @@ def target_names(model: LinearModel) -> list[str]:
 def _content(model: LinearModel, path: Path) -> tuple[dict[str, Any], bytes]:
     scale = (model.mm or 1.0) / _MM
     mean = model.mean * scale
-    blocks = [model.shape] if model.expression is None else [model.shape, model.expression]
-    displacements = np.concatenate([block.moved for block in blocks], axis=1) * scale
     centre, buffer = centre_if_far(mean), GltfBuffer()
     attributes = {"POSITION": buffer.vectors(mean - centre)}
-    steps = [column.reshape(-1, 3) for column in displacements.T]
+    steps = [column.reshape(-1, 3) for column in (model.moved * scale).T]
     targets = [{"POSITION": buffer.vectors(step)} for step in steps]
     primitive: dict[str, Any] = {"attributes": attributes, "targets": targets, "mode": _POINT_CLOUD}
     if model.faces is not None:

@@ -11,8 +11,16 @@ from typing import Final
 import numpy as np
 
 from shapespace.errors import ModelFileError, ShapespaceError
-from shapespace.formats.facts import KEY, facts_of, json_object, with_facts, write_folder
-from shapespace.formats.model_parts import LinearModel, Modes
+from shapespace.formats.model_parts import (
+    IDENTITY,
+    KEY,
+    LinearModel,
+    facts_of,
+    json_object,
+    split_modes,
+    with_facts,
+    write_folder,
+)
 from shapespace.io.containers.json_files import read_json
 from shapespace.io.files import read_bytes
 from shapespace.io.meshes.mesh_io import read_mesh
@@ -23,7 +31,6 @@ _ICT: Final = "generic_neutral_mesh"
 _ICT_MM = 10.0
 """ICT-FaceKit is in cm."""
 _NEUTRALS: Final = (_ICT, "neutral", "neutral_mesh")
-_IDENTITY = re.compile(r"identity[ _.-]?\d+", re.IGNORECASE)
 _FACTS = f"{KEY}.json"
 _LICENCES = ("LICENSE", "LICENSE.txt", "LICENSE.md", "LICENCE", "LICENCE.txt")
 _MOST_LICENCE_BYTES = 2**16  # 64 KiB
@@ -32,80 +39,74 @@ _MOST_SHAPES = 4096  # limit on files that are opened
 _AGAIN = "export all of them again with the same vertices and triangles"
 
 
-class ObjFolder:
-    """A folder with a neutral mesh, `identity000.obj` and so on, and `<expression>.obj`, all of one topology."""
-
-    name = "obj-folder"
-    title = "folder of OBJ blendshapes"
-    suffixes: Sequence[str] = ()
-
-    def recognises(self, path: Path, head: bytes) -> bool:
-        """Whether one OBJ file there is called neutral and another has as many vertices and faces."""
-        try:
-            neutral, mode_files = _files(path)
-            if neutral is None or not mode_files:
-                return False
-            return _counts(neutral) == _counts(mode_files[0]) != (0, 0)
-        except (OSError, ShapespaceError):
-            return False
-
-    def read(self, path: Path) -> LinearModel:
-        """As `ModelReader.read`."""
+def is_obj_folder(path: Path, head: bytes) -> bool:
+    """Whether one OBJ file there is called neutral and another has as many vertices and faces."""
+    try:
         neutral, mode_files = _files(path)
-        if neutral is None or not mode_files or len(mode_files) > _MOST_SHAPES:
-            raise ModelFileError(
-                f"{path} is no folder of blendshapes: it needs one OBJ file called neutral or {_ICT}, and 1 to "
-                f"{_MOST_SHAPES} others."
-            )
-        neutral_mesh = read_mesh(neutral)
-        steps: list[FloatArray] = []
-        for file in mode_files:
-            shape = read_mesh(file)
-            if len(shape.vertices) != len(neutral_mesh.vertices) or not are_same_triangles(
-                shape.faces, neutral_mesh.faces
-            ):
-                raise ModelFileError(
-                    f"{file} has other vertices or triangles than {neutral.name}, so that they are no blendshapes; "
-                    f"{_AGAIN}."
-                )
-            steps.append((shape.vertices - neutral_mesh.vertices).ravel())
-        names = [file.stem for file in mode_files]
-        shape, expression = _split_modes(np.stack(steps), names)
-        facts = json_object(read_json(path / _FACTS, "remove it") if (path / _FACTS).is_file() else None)
-        notes: list[str] = []
-        if not facts:
-            notes.append("Each shape is taken as one standard deviation of its mode.")
-        ict = neutral.stem.lower() == _ICT
-        return with_facts(
-            LinearModel(
-                mean=neutral_mesh.vertices,
-                shape=shape,
-                expression=expression,
-                faces=neutral_mesh.faces,
-                mm=1.0 if facts else _ICT_MM if ict else None,
-                provenance=f"{len(mode_files)} blendshapes of {path.name}",
-                licence=_licence(path),
-                notes=tuple(notes),
-            ),
-            facts,
-        )
+        if neutral is None or not mode_files:
+            return False
+        return _counts(neutral) == _counts(mode_files[0]) != (0, 0)
+    except (OSError, ShapespaceError):
+        return False
 
-    def write(self, model: LinearModel, path: Path) -> Sequence[str]:
-        """As `ModelFormat.write`; a new folder, in mm."""
-        mm = model.mm or 1.0
-        mean_mm = model.mean * mm
-        files = {f"{_ICT}.obj": write_obj(Mesh(mean_mm, model.faces))}
-        notes = ["Each shape is the mean and one standard deviation of a mode, in mm."]
-        for word, block in (("identity", model.shape), ("expression", model.expression)):
-            if block is None:
-                continue
-            names = block.names if word == "expression" and _are_file_names(block.names) else ()
-            for number, step in enumerate(block.moved.T):
-                name = names[number] if names else f"{word}{number:03d}"
-                files[f"{name}.obj"] = write_obj(Mesh(mean_mm + step.reshape(-1, 3) * mm, model.faces))
-        files[_FACTS] = json.dumps(facts_of(model), indent=1).encode()
-        write_folder(path, files)
-        return notes
+
+def read_obj_folder(path: Path) -> LinearModel:
+    """Read a folder with a neutral mesh, `identity000.obj` and so on, and `<expression>.obj`, all of one topology."""
+    neutral, mode_files = _files(path)
+    if neutral is None or not mode_files or len(mode_files) > _MOST_SHAPES:
+        raise ModelFileError(
+            f"{path} is no folder of blendshapes: it needs one OBJ file called neutral or {_ICT}, and 1 to "
+            f"{_MOST_SHAPES} others."
+        )
+    neutral_mesh = read_mesh(neutral)
+    steps: list[FloatArray] = []
+    for file in mode_files:
+        shape = read_mesh(file)
+        if len(shape.vertices) != len(neutral_mesh.vertices) or not are_same_triangles(shape.faces, neutral_mesh.faces):
+            raise ModelFileError(
+                f"{file} has other vertices or triangles than {neutral.name}, so that they are no blendshapes; "
+                f"{_AGAIN}."
+            )
+        steps.append((shape.vertices - neutral_mesh.vertices).ravel())
+    names = [file.stem for file in mode_files]
+    is_identity = [bool(IDENTITY.fullmatch(name)) for name in names]
+    shape, expression = split_modes(np.stack(steps, axis=1), names, is_identity)
+    facts = json_object(read_json(path / _FACTS, "remove it") if (path / _FACTS).is_file() else None)
+    notes: list[str] = []
+    if not facts:
+        notes.append("Each shape is taken as one standard deviation of its mode.")
+    ict = neutral.stem.lower() == _ICT
+    return with_facts(
+        LinearModel(
+            mean=neutral_mesh.vertices,
+            shape=shape,
+            expression=expression,
+            faces=neutral_mesh.faces,
+            mm=1.0 if facts else _ICT_MM if ict else None,
+            provenance=f"{len(mode_files)} blendshapes of {path.name}",
+            licence=_licence(path),
+            notes=tuple(notes),
+        ),
+        facts,
+    )
+
+
+def write_obj_folder(model: LinearModel, path: Path) -> Sequence[str]:
+    """As `ModelFormat.write`; a new folder, in mm."""
+    mm = model.mm or 1.0
+    mean_mm = model.mean * mm
+    files = {f"{_ICT}.obj": write_obj(Mesh(mean_mm, model.faces))}
+    notes = ["Each shape is the mean and one standard deviation of a mode, in mm."]
+    for word, block in (("identity", model.shape), ("expression", model.expression)):
+        if block is None:
+            continue
+        names = block.names if word == "expression" and _are_file_names(block.names) else ()
+        for number, step in enumerate(block.moved.T):
+            name = names[number] if names else f"{word}{number:03d}"
+            files[f"{name}.obj"] = write_obj(Mesh(mean_mm + step.reshape(-1, 3) * mm, model.faces))
+    files[_FACTS] = json.dumps(facts_of(model), indent=1).encode()
+    write_folder(path, files)
+    return notes
 
 
 def _files(folder: Path) -> tuple[Path | None, list[Path]]:
@@ -125,17 +126,6 @@ def _counts(path: Path) -> tuple[int, int]:
     return content.count(b"\nv "), content.count(b"\nf ")
 
 
-def _split_modes(steps: FloatArray, names: list[str]) -> tuple[Modes, Modes | None]:
-    identity = np.array([bool(_IDENTITY.fullmatch(name)) for name in names])
-    if not 0 < identity.sum() < len(names):
-        return Modes(steps.T, tuple(names)), None
-    parts = [
-        Modes(steps[chosen].T, tuple(name for name, is_chosen in zip(names, chosen, strict=True) if is_chosen))
-        for chosen in (identity, ~identity)
-    ]
-    return parts[0], parts[1]
-
-
 def _licence(folder: Path) -> str:
     file = next((folder / name for name in _LICENCES if (folder / name).is_file()), None)
     if file is None:
@@ -145,6 +135,6 @@ def _licence(folder: Path) -> str:
 
 
 def _are_file_names(names: Sequence[str]) -> bool:
-    plain = all(re.fullmatch(r"\w[\w .-]{0,80}", name) and not _IDENTITY.fullmatch(name) for name in names)
+    plain = all(re.fullmatch(r"\w[\w .-]{0,80}", name) and not IDENTITY.fullmatch(name) for name in names)
     lowered = {name.lower() for name in names}
     return bool(names) and plain and len(lowered) == len(names) and not lowered & set(_NEUTRALS)

@@ -9,25 +9,50 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from shapespace.errors import InputError, ModelFileError
-from shapespace.formats.eos import Eos
-from shapespace.formats.flame import Flame
-from shapespace.formats.gias import Gias
-from shapespace.formats.gltf_model import Gltf
-from shapespace.formats.matlab import Matlab
+from shapespace.formats.eos import is_eos, read_eos, write_eos
+from shapespace.formats.face_models import is_flame, is_matlab, read_flame, read_matlab
+from shapespace.formats.gias_monai import is_gias, is_monai, read_gias, read_monai
+from shapespace.formats.gltf_model import is_gltf_model, read_gltf_model, write_gltf_model
 from shapespace.formats.model_parts import LinearModel, ModelFormat, ModelReader
-from shapespace.formats.monai import Monai
-from shapespace.formats.obj_folder import ObjFolder
-from shapespace.formats.scalismo_json import ScalismoJson
-from shapespace.formats.shapeworks import ShapeWorks
-from shapespace.formats.statismo import Statismo
+from shapespace.formats.obj_folder import is_obj_folder, read_obj_folder, write_obj_folder
+from shapespace.formats.scalismo_json import is_scalismo_json, read_scalismo_json, write_scalismo_json
+from shapespace.formats.shapeworks import is_shapeworks, read_shapeworks, write_shapeworks
+from shapespace.formats.statismo import is_statismo, read_statismo, write_statismo
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import open_file
 
 MODEL_FORMATS: Mapping[str, ModelFormat] = {
-    one.name: one for one in (Eos(), Statismo(), ScalismoJson(), Gltf(), ObjFolder(), ShapeWorks())
+    one.name: one
+    for one in (
+        ModelFormat("eos", "eos .bin", (".bin",), is_eos, read_eos, write_eos),
+        ModelFormat(
+            "statismo", "statismo/scalismo HDF5", (".statismo.h5",), is_statismo, read_statismo, write_statismo
+        ),
+        ModelFormat(
+            "scalismo-json",
+            "scalismo .h5.json",
+            (".h5.json",),
+            is_scalismo_json,
+            read_scalismo_json,
+            write_scalismo_json,
+        ),
+        ModelFormat("gltf", "glTF morph targets", (".glb", ".gltf"), is_gltf_model, read_gltf_model, write_gltf_model),
+        ModelFormat("obj-folder", "folder of OBJ blendshapes", (), is_obj_folder, read_obj_folder, write_obj_folder),
+        ModelFormat(
+            "shapeworks", "ShapeWorks project", (".swproj", ".xlsx"), is_shapeworks, read_shapeworks, write_shapeworks
+        ),
+    )
 }
 """Formats that are read and written, by their names, in the order in which they are asked whether a file is theirs."""
-READ_ONLY_MODELS: Mapping[str, ModelReader] = {one.name: one for one in (Gias(), Flame(), Matlab(), Monai())}
+READ_ONLY_MODELS: Mapping[str, ModelReader] = {
+    one.name: one
+    for one in (
+        ModelReader("gias", "GIAS2 .pc.npz", (".pc.npz",), is_gias, read_gias),
+        ModelReader("flame", "FLAME/SMPL .npz and .pkl", (".npz", ".pkl"), is_flame, read_flame),
+        ModelReader("mat", "BFM 2009, LSFM and LYHM .mat", (".mat",), is_matlab, read_matlab),
+        ModelReader("monai-physio", "MONAI-Physio", (), is_monai, read_monai),
+    )
+}
 """Those that are only read, which are asked next."""
 LARGEST_BYTES = 2**34  # 16 GiB
 _HEAD_BYTES = 4096  # signatures and first fields of every format lie within it
@@ -65,7 +90,7 @@ def format_to_write(path: Path, name: str | None) -> ModelFormat:
     """
 
     def is_meant(candidate: ModelReader) -> bool:
-        return candidate.name == name or (name is None and path.name.lower().endswith(tuple(candidate.suffixes)))
+        return candidate.name == name or (name is None and path.name.lower().endswith(candidate.suffixes))
 
     if (meant := next(filter(is_meant, MODEL_FORMATS.values()), None)) is not None:
         return meant

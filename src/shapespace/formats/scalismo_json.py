@@ -15,8 +15,7 @@ import numpy.typing as npt
 
 from shapespace.errors import ModelFileError
 from shapespace.formats.model_parts import LinearModel
-from shapespace.formats.statismo import model_of
-from shapespace.formats.statismo_tree import tree_of
+from shapespace.formats.statismo import model_of, tree_of
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import atomic_path, read_bytes
 from shapespace.io.sandbox import SandboxError, Tree
@@ -38,36 +37,31 @@ _TEXT: Final = {
 _SCALAR: Final = {"class": "H5S_SCALAR"}
 
 
-class ScalismoJson:
-    """HDF5/JSON, the one format that scalismo writes from 0.92 on, whether the file is named `.json` or `.h5`."""
+def is_scalismo_json(path: Path, head: bytes) -> bool:
+    """Whether it begins as JSON, and is named as scalismo names it or begins as HDF5/JSON does."""
+    start = head.lstrip()
+    if not start.startswith(b"{"):
+        return False
+    return path.name.lower().endswith((".h5.json", ".h5")) or any(mark in head for mark in _MARKS)
 
-    name = "scalismo-json"
-    title = "scalismo .h5.json"
-    suffixes: Sequence[str] = (".h5.json",)
 
-    def recognises(self, path: Path, head: bytes) -> bool:
-        """Whether it begins as JSON, and is named as scalismo names it or begins as HDF5/JSON does."""
-        start = head.lstrip()
-        if not start.startswith(b"{"):
-            return False
-        return path.name.lower().endswith((".h5.json", ".h5")) or any(mark in head for mark in _MARKS)
+def read_scalismo_json(path: Path) -> LinearModel:
+    """Read HDF5/JSON, the one format that scalismo writes from 0.92 on, whether named `.json` or `.h5`."""
+    check_file(path, _LARGEST_BYTES, _AGAIN)
+    try:
+        tree = _tree(read_bytes(path))
+    except (ValueError, OverflowError, RecursionError, MemoryError) as error:
+        message = " ".join(str(error).split())[:120].rstrip(".")
+        raise ModelFileError(f"{path} is damaged, or no HDF5/JSON: {message}; {_AGAIN}.") from error
+    return model_of(tree, path)
 
-    def read(self, path: Path) -> LinearModel:
-        """As `ModelReader.read`."""
-        check_file(path, _LARGEST_BYTES, _AGAIN)
-        try:
-            tree = _tree(read_bytes(path))
-        except (ValueError, OverflowError, RecursionError, MemoryError) as error:
-            message = " ".join(str(error).split())[:120].rstrip(".")
-            raise ModelFileError(f"{path} is damaged, or no HDF5/JSON: {message}; {_AGAIN}.") from error
-        return model_of(tree, path)
 
-    def write(self, model: LinearModel, path: Path) -> Sequence[str]:
-        """As `ModelFormat.write`."""
-        tree, notes = tree_of(model)
-        with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as out:
-            out.writelines(_text_of(tree))
-        return notes
+def write_scalismo_json(model: LinearModel, path: Path) -> Sequence[str]:
+    """As `ModelFormat.write`."""
+    tree, notes = tree_of(model)
+    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as out:
+        out.writelines(_text_of(tree))
+    return notes
 
 
 class _Link(msgspec.Struct):
@@ -145,9 +139,7 @@ def _attributes(entries: Sequence[_Attribute]) -> dict[str, Any]:
     """Return numbers and texts by name; converters of HDF5 files write single ones as lists of one."""
     values: dict[str, Any] = {}
     for entry in entries:
-        value = entry.value
-        while isinstance(value, list) and len(cast(list[Any], value)) == 1:
-            value = cast(list[Any], value)[0]
+        value = _single(entry.value)
         if isinstance(value, str | int | float):
             values[entry.name] = value.rstrip("\0") if isinstance(value, str) else value
     return values
@@ -158,9 +150,7 @@ def _value(dataset: _Dataset, path: str) -> npt.NDArray[Any] | str | None:
     kind = str(_of(dataset.type, "class"))
     base = str(_of(dataset.type, "base"))
     if kind == "H5T_STRING":
-        value = msgspec.json.decode(dataset.value)
-        while isinstance(value, list) and len(cast(list[Any], value)) == 1:
-            value = cast(list[Any], value)[0]
+        value = _single(msgspec.json.decode(dataset.value))
         return value.rstrip("\0") if isinstance(value, str) else None
     if kind not in ("H5T_FLOAT", "H5T_INTEGER"):
         return None
@@ -177,6 +167,13 @@ def _value(dataset: _Dataset, path: str) -> npt.NDArray[Any] | str | None:
         raise SandboxError(f"{path} is cut short, or not of the shape {shape} that it says")
     # Characters of legacy VTK files are such numbers.
     return array.astype(np.uint8) if base.endswith(("I8LE", "U8LE", "I8BE", "U8BE")) else array
+
+
+def _single(value: Any) -> Any:
+    """Return what lists of one hold."""
+    while isinstance(value, list) and len(cast(list[Any], value)) == 1:
+        value = cast(list[Any], value)[0]
+    return cast(Any, value)
 
 
 def _of(value: Any, key: str) -> Any:

@@ -20,8 +20,7 @@ from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
 from shapespace.errors import InputError, ModelFileError, ShapespaceError
-from shapespace.formats.facts import KEY, facts_of, json_object, with_facts, write_folder
-from shapespace.formats.model_parts import LinearModel, Modes
+from shapespace.formats.model_parts import KEY, LinearModel, Modes, facts_of, json_object, with_facts, write_folder
 from shapespace.geometry.procrustes import align_in_place
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.containers.json_files import check_file, parse_json
@@ -53,69 +52,63 @@ _IDENTITY = " ".join(str(value) for value in np.eye(4).ravel())
 Row = Mapping[str, str]
 
 
-class ShapeWorks:
-    """The particles of all subjects as a model, on the mesh of the most average one where there are meshes."""
+def is_shapeworks(path: Path, head: bytes) -> bool:
+    """Whether it is called a project and begins as JSON or as a workbook does."""
+    begin = {".swproj": b"{", ".xlsx": b"PK"}.get(path.suffix.lower())
+    return begin is not None and head.lstrip()[: len(begin)] == begin
 
-    name = "shapeworks"
-    title = "ShapeWorks project"
-    suffixes: Sequence[str] = (".swproj", ".xlsx")
 
-    def recognises(self, path: Path, head: bytes) -> bool:
-        """Whether it is called a project and begins as JSON or as a workbook does."""
-        begin = {".swproj": b"{", ".xlsx": b"PK"}.get(path.suffix.lower())
-        return begin is not None and head.lstrip()[: len(begin)] == begin
+def read_shapeworks(path: Path) -> LinearModel:
+    """Read the particles of all subjects as a model, on the mesh of the most average one where there are meshes."""
+    check_file(path, _LARGEST_PROJECT_BYTES, _AGAIN)
+    content = read_bytes(path)
+    facts: Mapping[str, Any] = {}
+    if path.suffix.lower() == ".xlsx":
+        rows = _sheet(content, path)
+    else:
+        tree = json_object(parse_json(content, path, _AGAIN))
+        rows = _rows(tree.get("data"))
+        facts = json_object(tree.get(KEY))
+    return with_facts(_model(_Project(path, rows, Allowance(len(content), path))), facts)
 
-    def read(self, path: Path) -> LinearModel:
-        """As `ModelReader.read`."""
-        check_file(path, _LARGEST_PROJECT_BYTES, _AGAIN)
-        content = read_bytes(path)
-        facts: Mapping[str, Any] = {}
-        if path.suffix.lower() == ".xlsx":
-            rows = _sheet(content, path)
-        else:
-            tree = json_object(parse_json(content, path, _AGAIN))
-            rows = _rows(tree.get("data"))
-            facts = json_object(tree.get(KEY))
-        return with_facts(_model(_Project(path, rows, Allowance(len(content), path))), facts)
 
-    def write(self, model: LinearModel, path: Path) -> Sequence[str]:
-        """As `ModelFormat.write`; vertices become particles, the model as many shapes as have its mean and covariance.
+def write_shapeworks(model: LinearModel, path: Path) -> Sequence[str]:
+    """As `ModelFormat.write`; vertices become particles, the model as many shapes as have its mean and covariance.
 
-        K modes take K + 1 shapes, none further than 1.42 standard deviations in any mode: the rows of a cosine
-        transform, which sum to zero and are orthogonal.
-        """
-        if path.suffix.lower() == ".xlsx":
-            raise InputError(f"{path} cannot be written: workbooks are only read; give a name that ends in .swproj.")
-        blocks = [model.shape] if model.expression is None else [model.shape, model.expression]
-        displacements = np.concatenate([block.moved for block in blocks], axis=1) * (model.mm or 1.0)
-        mean = model.mean * (model.mm or 1.0)
-        count = displacements.shape[1] + 1
-        z = np.asarray(dct(np.eye(count), norm="ortho", axis=0), dtype=np.float64)[1:] * np.sqrt(count - 1)
-        folder = path.with_name(f"{path.stem}_particles")
-        files: dict[str, bytes] = {}
-        rows: list[dict[str, str]] = []
-        for number in range(count):
-            vertices = mean + (displacements @ z[:, number]).reshape(-1, 3)
-            name = f"shape_{number:03d}"
-            particles, surface = f"{name}.particles", f"{name}.vtk"
-            files[particles] = number_lines(vertices, "%.17g %.17g %.17g").encode()
-            row = {"name": name}
-            if model.faces is not None:
-                files[surface] = write_vtk(Mesh(vertices, model.faces))
-                row |= {f"{key}_1": f"{folder.name}/{surface}" for key in ("shape", "groomed")}
-            row |= {f"{key}_particles_1": f"{folder.name}/{particles}" for key in ("local", "world")}
-            rows.append({**row, "alignment_1": _IDENTITY, "procrustes_1": _IDENTITY})
-        write_folder(folder, files)
-        tree = {"data": rows, "optimize": {"number_of_particles": str(len(mean))}, KEY: facts_of(model)}
-        write_text(path, json.dumps(tree, indent=1) + "\n")
-        notes = [
-            f"The model is {count} shapes in {folder.name}, whose mean and covariance (n - 1) are its own; they are no "
-            "subjects.",
-            f"Each of the {len(mean)} vertices is a particle, in mm.",
-        ]
-        if model.expression is not None:
-            notes.append("Identity and expression are no longer apart.")
-        return notes
+    K modes take K + 1 shapes, none further than 1.42 standard deviations in any mode: the rows of a cosine
+    transform, which sum to zero and are orthogonal.
+    """
+    if path.suffix.lower() == ".xlsx":
+        raise InputError(f"{path} cannot be written: workbooks are only read; give a name that ends in .swproj.")
+    displacements = model.moved * (model.mm or 1.0)
+    mean = model.mean * (model.mm or 1.0)
+    count = displacements.shape[1] + 1
+    z = np.asarray(dct(np.eye(count), norm="ortho", axis=0), dtype=np.float64)[1:] * np.sqrt(count - 1)
+    folder = path.with_name(f"{path.stem}_particles")
+    files: dict[str, bytes] = {}
+    rows: list[dict[str, str]] = []
+    for number in range(count):
+        vertices = mean + (displacements @ z[:, number]).reshape(-1, 3)
+        name = f"shape_{number:03d}"
+        particles, surface = f"{name}.particles", f"{name}.vtk"
+        files[particles] = number_lines(vertices, "%.17g %.17g %.17g").encode()
+        row = {"name": name}
+        if model.faces is not None:
+            files[surface] = write_vtk(Mesh(vertices, model.faces))
+            row |= {f"{key}_1": f"{folder.name}/{surface}" for key in ("shape", "groomed")}
+        row |= {f"{key}_particles_1": f"{folder.name}/{particles}" for key in ("local", "world")}
+        rows.append({**row, "alignment_1": _IDENTITY, "procrustes_1": _IDENTITY})
+    write_folder(folder, files)
+    tree = {"data": rows, "optimize": {"number_of_particles": str(len(mean))}, KEY: facts_of(model)}
+    write_text(path, json.dumps(tree, indent=1) + "\n")
+    notes = [
+        f"The model is {count} shapes in {folder.name}, whose mean and covariance (n - 1) are its own; they are no "
+        "subjects.",
+        f"Each of the {len(mean)} vertices is a particle, in mm.",
+    ]
+    if model.expression is not None:
+        notes.append("Identity and expression are no longer apart.")
+    return notes
 
 
 @dataclass

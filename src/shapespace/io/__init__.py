@@ -1,6 +1,6 @@
 """Files: readers with bounds, writers that leave whole files, and meshes of other tools.
 
-Entry points: `meshes.mesh_io`, `landmarks.landmark_io`, `volumes.volume_io`, `tables.table_io`, `interop`. Imported by
+Entry points: `meshes.mesh_io`, `landmarks.landmark_io`, `volume_io`, `tables.table_io`, `interop`. Imported by
 every layer above; knows no model.
 """
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from shapespace.io.landmarks.landmark_io import read_landmarks, write_landmarks
     from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
     from shapespace.io.trees import Tree, read_tree
-    from shapespace.io.volumes.volume_io import read_volume
+    from shapespace.io.volume_io import read_volume
     from shapespace.types import LabelVolume
 
 __all__ = [
@@ -38,7 +38,7 @@ __getattr__, __dir__ = lazy_names(
         "io.interop": ("as_mesh",),
         "io.landmarks.landmark_io": ("read_landmarks", "write_landmarks"),
         "io.meshes.mesh_io": ("read_mesh", "write_mesh"),
-        "io.volumes.volume_io": ("read_volume",),
+        "io.volume_io": ("read_volume",),
         "types": ("LabelVolume",),
         "io.landmarks.configuration_io": ("read_configurations", "write_configurations"),
         "io.landmarks.landmark_configurations": ("LandmarkConfigurations",),

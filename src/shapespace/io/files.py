@@ -69,13 +69,31 @@ def read_error(path: Path, error: OSError) -> FileError:
     return FileError(f"Cannot read {path}: {error.strerror or error}.")
 
 
+@contextlib.contextmanager
+def reading(path: Path) -> Generator[None]:
+    """Raise an `OSError` of the block as the `FileError` of `read_error`."""
+    try:
+        yield
+    except OSError as error:
+        raise read_error(path, error) from error
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Generator[None]:
+    """Raise an `OSError` of the block as the `FileError` of `write_error`."""
+    try:
+        yield
+    except OSError as error:
+        raise write_error(path, error) from error
+
+
 def open_file(path: Path) -> BufferedReader:
     """Open the regular file `path` for reading; a pipe or a device, which may give nothing or never end, is refused.
 
     Raises:
         FileError: it does not exist, cannot be read, or is no file.
     """
-    try:
+    with reading(path):
         # Without this flag, opening a pipe waits for somebody to write into it.
         handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
         try:
@@ -88,8 +106,6 @@ def open_file(path: Path) -> BufferedReader:
         except BaseException:
             os.close(handle)
             raise
-    except OSError as error:
-        raise read_error(path, error) from error
 
 
 def read_bytes(path: Path, at_most: int | None = None) -> bytes:
@@ -102,17 +118,14 @@ def read_bytes(path: Path, at_most: int | None = None) -> bytes:
     Raises:
         FileError: it does not exist, cannot be read, is no file, or is too long.
     """
-    with open_file(path) as stream:
-        try:
-            size = os.fstat(stream.fileno()).st_size
-            if at_most is not None and size > at_most:
-                raise FileError(
-                    f"Cannot read {path}: it has {size / 2**20:.1f} MiB, and files of this kind are read up to "
-                    f"{at_most / 2**20:.0f} MiB; thin or split it first."
-                )
-            return stream.read() if at_most is None else stream.read(size)
-        except OSError as error:
-            raise read_error(path, error) from error
+    with open_file(path) as stream, reading(path):
+        size = os.fstat(stream.fileno()).st_size
+        if at_most is not None and size > at_most:
+            raise FileError(
+                f"Cannot read {path}: it has {size / 2**20:.1f} MiB, and files of this kind are read up to "
+                f"{at_most / 2**20:.0f} MiB; thin or split it first."
+            )
+        return stream.read() if at_most is None else stream.read(size)
 
 
 def make_folder(path: Path) -> Path:
@@ -121,10 +134,8 @@ def make_folder(path: Path) -> Path:
     Raises:
         FileError: it cannot be created.
     """
-    try:
+    with writing(path):
         path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise write_error(path, error) from error
     return path
 
 
@@ -161,17 +172,13 @@ def write_together(files: Mapping[Path, Callable[[Path], object]], remove: Itera
         for path, write in files.items():
             written[path] = _temporary_beside(path)
             stack.callback(written[path].unlink, missing_ok=True)
-            try:
+            with writing(path):
                 write(written[path])
-            except OSError as error:
-                raise write_error(path, error) from error
         for path in (*list(files)[-1:], *remove):
             remove_file(path)
         for path, temporary in written.items():
-            try:
+            with writing(path):
                 _move_into_place(temporary, path)
-            except OSError as error:
-                raise write_error(path, error) from error
 
 
 @contextlib.contextmanager
@@ -182,10 +189,8 @@ def temporary_folder(parent: Path) -> Generator[Path]:
         FileError: `parent` cannot be written.
     """
     _sweep_once(parent)
-    try:
+    with writing(parent):
         stack = tempfile.TemporaryDirectory(prefix=_prefix("folder"), dir=parent)
-    except OSError as error:
-        raise write_error(parent, error) from error
     with stack as name:
         yield Path(name)
 
@@ -198,11 +203,9 @@ def _temporary_beside(path: Path) -> Path:
     _sweep_once(path.parent)
     # The temporary file of a temporary file also contains the name of its target.
     stem = path.stem.split("-", 3)[-1] if path.name.startswith(_TEMPORARY) else path.stem
-    try:
+    with writing(path):
         handle, name = tempfile.mkstemp(prefix=_prefix(stem[:40]), suffix=path.suffix, dir=path.parent)
         os.close(handle)
-    except OSError as error:
-        raise write_error(path, error) from error
     return Path(name)
 
 
@@ -273,10 +276,8 @@ def remove_file(path: Path) -> None:
     Raises:
         FileError: it cannot be removed.
     """
-    try:
+    with writing(path):
         path.unlink(missing_ok=True)
-    except OSError as error:
-        raise write_error(path, error) from error
 
 
 def move_file(source: Path, target: Path) -> None:
@@ -285,10 +286,8 @@ def move_file(source: Path, target: Path) -> None:
     Raises:
         FileError: it cannot be moved.
     """
-    try:
+    with writing(target):
         source.replace(target)
-    except OSError as error:
-        raise write_error(target, error) from error
 
 
 def sha256_of_file(path: Path) -> str:
@@ -297,8 +296,5 @@ def sha256_of_file(path: Path) -> str:
     Raises:
         FileError: it cannot be read.
     """
-    with open_file(path) as stream:
-        try:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
-        except OSError as error:
-            raise read_error(path, error) from error
+    with open_file(path) as stream, reading(path):
+        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -103,17 +103,10 @@ def _mesh_arrays(x: Any, mesh_name: str) -> tuple[Any, Any]:
     if isinstance(x, np.ndarray):
         return cast(Any, x), None
     if isinstance(x, list | tuple):
-        return _check_pair(cast(Sequence[Any], x), mesh_name)
-    return _object_arrays(x, mesh_name)
-
-
-def _check_pair(x: Sequence[Any], mesh_name: str) -> tuple[Any, Any]:
-    if len(x) != 2:
-        raise InputError(f"{mesh_name}: give vertices and triangles as a pair of arrays, not {len(x)} things.")
-    return x[0], x[1]
-
-
-def _object_arrays(x: Any, mesh_name: str) -> tuple[Any, Any]:
+        pair = cast(Sequence[Any], x)
+        if len(pair) != 2:
+            raise InputError(f"{mesh_name}: give vertices and triangles as a pair of arrays, not {len(pair)} things.")
+        return pair[0], pair[1]
     if hasattr(x, "points") and hasattr(x, "cells") and hasattr(x, "cells_dict"):  # meshio
         return x.points, _triangles_of_cells(x.cells_dict, mesh_name)
     if hasattr(x, "points") and hasattr(x, "trilist"):  # menpo

@@ -25,6 +25,7 @@ CUT_SHORT = "the file is damaged or cut short, so export it again"
 _BLOCK_BYTES = 1 << 18
 _LINE_END = re.compile(rb"\r?\n|\r")
 _SPACE = re.compile(rb"\s")
+_WORD = re.compile(rb"\s*(\S+)[ \t]*\r?\n?")
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 SPACE = "SPACE=LPS"
 """Mark of the frame in headers of meshes, as 3D Slicer writes it."""
@@ -148,17 +149,38 @@ def line_blocks(text: bytes) -> Iterator[list[bytes]]:
         yield block.splitlines()
 
 
-def word_block(text: bytes, start: int, size: int = _BLOCK_BYTES) -> tuple[list[bytes], int]:
-    """Return the words in about `size` bytes of `text` from byte `start`, and where the next begin."""
-    block, stop = _block(text, start, _SPACE, size)
-    return block.split(), stop
+class WordCursor:
+    """Read position in text of words between white space, of which few are in memory at a time.
 
+    Args:
+        data: the file.
+        path: for messages.
+        position: of the first byte to read.
+    """
 
-def _word_blocks(text: bytes) -> Iterator[list[bytes]]:
-    offset = 0
-    while offset < len(text):
-        words, offset = word_block(text, offset)
-        yield words
+    def __init__(self, data: bytes, path: Path, position: int = 0) -> None:
+        self.data, self.path, self.position = data, path, position
+        self.left = len(data) - position + 1
+        """Bytes of text from the first position on, and one for the space that the last word does without."""
+
+    def word(self) -> bytes:
+        """Return the next word, or nothing at the end."""
+        match = _WORD.match(self.data, self.position)
+        if match is None:
+            return b""
+        self.position = match.end()
+        return match[1]
+
+    def words(self, count: int) -> Iterator[list[bytes]]:
+        """Yield the next `count` words in lists; fewer where the text ends."""
+        while count > 0 and self.position < len(self.data):
+            block, stop = _block(self.data, self.position, _SPACE, 16 * count)
+            words = block.split(None, count)
+            if len(words) > count:
+                stop -= len(words.pop())
+            self.position = stop
+            count -= len(words)
+            yield words
 
 
 def floats_of(text: bytes, path: Path) -> FloatArray:
@@ -167,7 +189,7 @@ def floats_of(text: bytes, path: Path) -> FloatArray:
     Raises:
         FileFormatError: one of them is not a number.
     """
-    return join_parts([floats(words, path) for words in _word_blocks(text)], np.float64)
+    return join_parts([floats(words, path) for words in WordCursor(text, path).words(len(text))], np.float64)
 
 
 def ints_of(text: bytes, path: Path) -> IndexArray:
@@ -176,7 +198,7 @@ def ints_of(text: bytes, path: Path) -> IndexArray:
     Raises:
         FileFormatError: one of them is not a whole number, or is too large for 64 bits.
     """
-    return join_parts([ints(words, path) for words in _word_blocks(text)], np.int64)
+    return join_parts([ints(words, path) for words in WordCursor(text, path).words(len(text))], np.int64)
 
 
 def join_parts(parts: Sequence[npt.NDArray[Any]], kind: npt.DTypeLike, *row: int) -> npt.NDArray[Any]:

@@ -106,10 +106,8 @@ def _copy(address: str, file: Path, most_bytes: int) -> None:
 
 
 def _files(address: str) -> tuple[Any, str]:
-    try:
-        from fsspec.core import url_to_fs  # pyright: ignore[reportUnknownVariableType]
-    except ImportError as error:
-        raise _missing_extra_error("remote") from error
+    from fsspec.core import url_to_fs  # pyright: ignore[reportUnknownVariableType]
+
     filesystem: tuple[Any, str] = url_to_fs(address)  # pyright: ignore[reportUnknownVariableType]
     return filesystem
 
@@ -122,16 +120,12 @@ def _translate_errors(address: str) -> Generator[None]:
     except ShapespaceError:
         raise
     except ImportError as error:
-        raise _missing_extra_error("remote") from error
+        raise ShapespaceError(
+            "Addresses need the extra 'remote', and s3:// and gs:// need s3fs and gcsfs too; run "
+            "pip install 'shapespace[remote]' s3fs gcsfs, or give files."
+        ) from error
     except FileNotFoundError as error:
         raise FileError(f"Cannot read {address}: there is no such file; check the address.") from error
     except Exception as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise FileError(f"Cannot read {address}: {reason}; check the address and the connection.") from error
-
-
-def _missing_extra_error(extra: str) -> ShapespaceError:
-    return ShapespaceError(
-        f"Addresses need the extra '{extra}', and s3:// and gs:// need s3fs and gcsfs too; run "
-        f"pip install 'shapespace[{extra}]' s3fs gcsfs, or give files."
-    )

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapespace.io.containers.arrays import read_arrays, write_arrays
+from shapespace.io.containers.archives import kept_arrays, write_arrays
 from shapespace.types import FloatArray
 
 _DEPENDENT = 1e-13
@@ -91,7 +91,7 @@ def leading(
         basis.append(Q)
         step = len(basis)
         file = None if passes is None else passes / f"pass-{step:03d}.npz"
-        kept = None if file is None else read_arrays(file)
+        kept = None if file is None else kept_arrays(file)
         if kept is None:
             W = apply(Q)
             products = _taken_off(W, basis)

@@ -33,7 +33,7 @@ from shapespace.geometry.procrustes import (
     scale_to_tangent_streamed,
 )
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.io.containers.arrays import read_arrays, write_arrays
+from shapespace.io.containers.archives import kept_arrays, write_arrays
 from shapespace.io.containers.row_spill import Spill
 from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_error, write_text
 from shapespace.io.memory_cache import available_bytes
@@ -122,7 +122,7 @@ class KeptShapes:
                 "--keep-shapes (keep_shapes), which keeps them there."
             )
         try:
-            arrays = read_arrays(path) or {}
+            arrays = kept_arrays(path) or {}
             header = json.loads(str(arrays["header"]))
             shape = arrays["template"].shape
             if len(shape) != 2 or shape[1] != 3 or arrays["reference"].shape != shape or arrays["sizes"].ndim != 1:
@@ -395,9 +395,9 @@ class _Work:
     def aligned(self) -> Generator[tuple[Spill, KeptShapes]]:
         """Yield the file of aligned shapes, and the data of the shapes: as a killed build left it, or made anew."""
         path, start, done = (self.folder / name for name in (_SHAPES, _START, _ALIGNED))
-        poses = read_arrays(self.folder / _POSES)
+        poses = kept_arrays(self.folder / _POSES)
         complete = path.is_file() and path.stat().st_size == 4 * self.count * self.first.vertices.size
-        near = read_arrays(start) if complete else None
+        near = kept_arrays(start) if complete else None
         if complete and done.is_file() and poses is not None:
             with Spill(path, self.count, self.first.vertices.size, new=False) as shapes:
                 yield shapes, self._about(poses)

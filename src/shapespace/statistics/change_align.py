@@ -12,7 +12,7 @@ from scipy.stats import chi
 from shapespace.cohort.cohort import Cohort
 from shapespace.errors import InputError
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.io.meshes.region_files import read_region
+from shapespace.io.landmarks.landmark_io import read_region
 from shapespace.model.shape_model import region_vertices
 from shapespace.types import FloatArray, IntArray, Similarity, SurfaceLandmarks
 

@@ -21,8 +21,7 @@ from shapespace.cohort.table import list_names
 from shapespace.errors import CorrespondenceError, FileFormatError, InputError
 from shapespace.geometry.procrustes import Gauge
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.io.containers.archives import read_arrays
-from shapespace.io.containers.arrays import write_arrays
+from shapespace.io.containers.archives import read_arrays, write_arrays
 from shapespace.io.containers.json_files import plain_json
 from shapespace.lazy import lazy_import
 from shapespace.reprs import describe_briefly, short_repr

@@ -11,8 +11,7 @@ from pathlib import Path
 from shapespace.errors import InputError
 from shapespace.geometry.mirror_plane import mirror_image
 from shapespace.io.containers.json_files import read_json
-from shapespace.io.meshes.mesh_folders import mesh_files
-from shapespace.io.meshes.mesh_io import stem_of
+from shapespace.io.meshes.mesh_io import mesh_files, stem_of
 from shapespace.reprs import first_names
 from shapespace.schemas import (
     CORRESPOND_AGAIN,

@@ -1,13 +1,15 @@
-"""Readers of untrusted zip archives of arrays, such as .npz files: no pickles, memory proportional to the file size."""
+"""Archives of arrays (.npz), other zip archives and gzip files: no pickles, memory proportional to the file size."""
 
 from __future__ import annotations
 
+import gzip
 import io
 import math
 import zipfile
+import zlib
 from collections.abc import Callable, Collection, Generator, Mapping
 from pathlib import Path
-from typing import IO, Any, BinaryIO, Final
+from typing import IO, Any, BinaryIO, Final, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -15,8 +17,12 @@ from numpy.lib import format as npy
 
 from shapespace.errors import FileFormatError
 from shapespace.io.containers.json_files import check_file
-from shapespace.io.files import read_error
+from shapespace.io.files import atomic_path, read_error
+from shapespace.io.parsing import CUT_SHORT, damage_error
+from shapespace.io.read_limits import GROWTH
 
+GZIP: Final = b"\x1f\x8b"
+"""With which a gzip file begins."""
 LARGEST_BYTES: Final = 2**30  # 1 GiB, packed
 _MOST_MEMBERS = 4096  # limit on damaged files; results have tens
 _MOST_PACKED = 100
@@ -30,6 +36,16 @@ _HEADER_READERS: Final[Mapping[tuple[int, int], Callable[[IO[bytes]], tuple[Any,
     (1, 0): npy.read_array_header_1_0,
     (2, 0): npy.read_array_header_2_0,
 }
+
+
+def write_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+    """Write `arrays` to `path`, whole or not at all.
+
+    Raises:
+        FileError: the folder cannot be written, or the disk is full.
+    """
+    with atomic_path(path) as temporary, temporary.open("wb") as stream:
+        np.savez(stream, **cast(dict[str, Any], arrays))
 
 
 def read_arrays(path: Path, remedy: str, member_names: Collection[str] | None = None) -> dict[str, npt.NDArray[Any]]:
@@ -54,6 +70,15 @@ def read_arrays(path: Path, remedy: str, member_names: Collection[str] | None = 
         raise FileFormatError(
             f"{path} is not an .npz file of arrays, or it is cut short ({error}); {remedy}."
         ) from error
+
+
+def kept_arrays(path: Path) -> dict[str, npt.NDArray[Any]] | None:
+    """Return the arrays in `path`; None where there are none, or none that are whole."""
+    try:
+        with path.open("rb") as stream:
+            return arrays_in(stream, path.stat().st_size)
+    except (OSError, ValueError):
+        return None
 
 
 def arrays_in(stream: BinaryIO, size: int, member_names: Collection[str] | None = None) -> dict[str, npt.NDArray[Any]]:
@@ -193,3 +218,28 @@ def npy_array(data: bytes) -> npt.NDArray[Any]:
         np.frombuffer(data, dtype, math.prod(shape), start) if len(data) > start else np.empty(0, dtype)
     )
     return flat.reshape(shape, order="F" if fortran else "C").copy(order="K")
+
+
+def unpack_gzip(data: bytes, path: Path, max_bytes: int) -> bytes:
+    """Return what `data`, all of a gzip file, holds.
+
+    Args:
+        data: the whole file.
+        path: its name, for messages.
+        max_bytes: largest size of the content.
+
+    Raises:
+        FileFormatError: it is cut short or damaged, or unpacks to more than `max_bytes`, or `read_limits.GROWTH` times
+            its size.
+    """
+    max_bytes = min(max_bytes, max(GROWTH * len(data), _SMALL))
+    try:
+        with gzip.GzipFile(fileobj=io.BytesIO(data)) as stream:
+            content = stream.read(max_bytes + 1)
+    except (OSError, EOFError, zlib.error) as error:
+        raise damage_error(path, f"its compressed data end early or are wrong; {CUT_SHORT}") from error
+    if len(content) > max_bytes:
+        raise damage_error(
+            path, f"it unpacks to more than {max_bytes / 2**20:.0f} MiB, so unpack it with gunzip and look at it"
+        )
+    return content

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import FileFormatError
-from shapespace.io.files import read_error, write_error
+from shapespace.io.files import reading, write_error, writing
 from shapespace.types import FloatArray
 
 _PANEL = 1024  # columns; 8 KiB of each row are read in one piece
@@ -42,10 +42,8 @@ class Spill:
     def __init__(self, path: Path, rows: int, columns: int, *, new: bool) -> None:
         self.path, self.rows, self.columns = path, rows, columns
         size = rows * columns * _FLOAT32.itemsize
-        try:
+        with writing(path) if new else reading(path):
             self._file = FileIO(path, "w+" if new else "r+")
-        except OSError as error:
-            raise (write_error if new else read_error)(path, error) from error
         try:
             if new:
                 self._reserve(size)
@@ -92,12 +90,10 @@ class Spill:
         single = block.astype(_FLOAT32)
         for columns in self._panels():
             part = np.ascontiguousarray(single[:, columns]).data.cast("B")
-            try:
+            with writing(self.path):
                 self._seek(columns, start)
                 while len(part):
                     part = part[self._file.write(part) :]
-            except OSError as error:
-                raise write_error(self.path, error) from error
 
     def rows_from(self, start: int, stop: int) -> FloatArray:
         """Return the rows (stop - start, D).
@@ -130,10 +126,8 @@ class Spill:
         Raises:
             FileError: the disk is full.
         """
-        try:
+        with writing(self.path):
             os.fsync(self._file.fileno())
-        except OSError as error:
-            raise write_error(self.path, error) from error
 
     def _panels(self) -> list[slice]:
         return [slice(start, min(start + _PANEL, self.columns)) for start in range(0, self.columns, _PANEL)]
@@ -145,13 +139,11 @@ class Spill:
     def _read(self, columns: slice, start: int, stop: int) -> npt.NDArray[np.float32]:
         part = np.empty((stop - start, columns.stop - columns.start), dtype=_FLOAT32)
         view = part.data.cast("B")
-        try:
+        with reading(self.path):
             self._seek(columns, start)
             while len(view):
                 count = self._file.readinto(view)
                 if not count:
                     raise FileFormatError(f"{self.path} is cut short; start again.")
                 view = view[count:]
-        except OSError as error:
-            raise read_error(self.path, error) from error
         return part

@@ -58,7 +58,6 @@ _SINGLE = tuple(sorted({*LANDMARK_FORMATS, *READ_ONLY_LANDMARKS} - {".tps"}, key
 _MILLIMETRES = (".mrk.json", ".fcsv")
 _TPS_KEYS = ("image", "comment")
 """Columns that TPS has keys for."""
-_NAMED = 3  # names in a sentence
 RECORD = "align.json"
 """File of a folder that `align` wrote, with its settings; its coordinates have been aligned."""
 CURVE_SLIDERS, SURFACE_SLIDERS = "curveslide.csv", "surfslide.csv"
@@ -254,7 +253,7 @@ def _read_folder(folder: Path, curve_points: int | None) -> LandmarkConfiguratio
     # landmarks.
     ending = max(files, key=lambda one: (one not in _LINES, len(files[one]), one == ".mrk.json"))
     others = [file.name for other, listed in files.items() if other != ending for file in listed]
-    notes = [f"{len(others)} files without {ending} are left out ({first_names(others, _NAMED)})."] if others else []
+    notes = [f"{len(others)} files without {ending} are left out ({first_names(others)})."] if others else []
     parts = _join_files(
         [_read_file(file, None) if ending in _MANY else _read_specimen(file, ending) for file in files[ending]]
     )
@@ -263,7 +262,7 @@ def _read_folder(folder: Path, curve_points: int | None) -> LandmarkConfiguratio
     labelled = [_with_labels_of(parts[0], part) for part in parts]
     if renamed := [Path(old.where).name for old, new in zip(parts, labelled, strict=True) if new is not old]:
         notes.append(
-            f"Labels of {first_names(renamed, _NAMED)} differ from {Path(parts[0].where).name} before the number, and "
+            f"Labels of {first_names(renamed)} differ from {Path(parts[0].where).name} before the number, and "
             "are matched by number; lists and curves by their order."
         )
     parts = labelled
@@ -273,7 +272,7 @@ def _read_folder(folder: Path, curve_points: int | None) -> LandmarkConfiguratio
         file, place = Path(part.where), {name: k for k, name in enumerate(part.landmarks)}
         if part.dimensions != first.dimensions or place.keys() != set(first.landmarks):
             has, expected = (f"{len(one.landmarks)} landmarks in {one.dimensions}-D" for one in (part, first))
-            other = first_names(sorted(place.keys() ^ set(first.landmarks)), _NAMED)
+            other = first_names(sorted(place.keys() ^ set(first.landmarks)))
             raise damage_error(
                 file, f"it has {has} and {Path(first.where).name} has {expected}"
                 f"{f' ({other} in one of them alone)' if other else ''}; give the same landmarks to all files, with NA "

@@ -24,7 +24,6 @@ _NUMBERED = re.compile(r"(?:(?:raw|proc)[ ._-]?)?coord[ ._-]?\d+", re.IGNORECASE
 """Columns of coordinates of MorphoJ, whose names have no axis."""
 _LANDMARK = ("landmark", "landmarks", "lm", "point", "semilandmark")
 _KEYS = (*KEYS, "individual", "label", "identifier")
-_NAMED = 3  # names in a sentence
 
 
 def header_kind(header: Sequence[str]) -> str:
@@ -153,7 +152,7 @@ def _long(header: Sequence[str], rows: Sequence[Sequence[str]], path: Path) -> L
     if absent:
         lacking = [name for name, count in Counter(name for name, _ in pairs).items() if count < len(labels)]
         nouns = "landmark without a row is" if absent == 1 else "landmarks without a row are"
-        notes.append(f"{absent} {nouns} missing ({first_names(lacking, _NAMED)}).")
+        notes.append(f"{absent} {nouns} missing ({first_names(lacking)}).")
     return LandmarkConfigurations(
         names=names, points=points, landmarks=labels, columns=columns, where=str(path), notes=tuple(notes)
     )
@@ -188,7 +187,7 @@ def morphoj_texts(raw: LandmarkConfigurations) -> tuple[str, str]:
     """Return the two tables of MorphoJ, separated by tabs: coordinates, and classifier variables."""
     lacking = [name for name, row in zip(raw.names, raw.observed, strict=True) if not row.all()]
     if lacking:
-        names = first_names(lacking, _NAMED)
+        names = first_names(lacking)
         raise InputError(f"MorphoJ cannot read missing landmarks ({names}); estimate them first with shapespace align.")
     numbers = range(1, len(raw.landmarks) + 1)
     table = [["ID", *(f"{axis}{k}" for k in numbers for axis in "xyz"[: raw.dimensions])]]

@@ -21,7 +21,6 @@ NO_SLIDERS = np.zeros((0, 3), dtype=np.int32)
 _NO_POINTS = np.zeros(0, dtype=np.int32)
 Curve: TypeAlias = tuple[tuple[int, ...], bool]
 """Numbers of the points along a curve, from 0, and whether the first point follows the last."""
-_NAMED = 3  # specimens in a sentence
 _MOST_CURVE_POINTS = 100
 """Points of a resampled curve by default; lines between them are within 0.4 % of the size (RMS) of the original in 99
 sections of femora and spleens."""
@@ -198,7 +197,7 @@ def mark_missing(raw: LandmarkConfigurations) -> LandmarkConfigurations:
             affected = [raw.names[int(row)] for row in np.unique(np.nonzero(mask)[0])]
             count = int(mask.sum())
             noun, verb = ("landmark", "is") if count == 1 else ("landmarks", "are")
-            notes.append(f"{count} {noun} of {first_names(affected, _NAMED)} {reason} {verb} taken as missing.")
+            notes.append(f"{count} {noun} of {first_names(affected)} {reason} {verb} taken as missing.")
     return replace(raw, points=points, notes=tuple(notes))
 
 

@@ -1,4 +1,4 @@
-"""Readers and writers of landmark files."""
+"""Readers and writers of landmark files, of landmarks and regions by numbers of vertices, and of fitted landmarks."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import csv
 import json
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -20,13 +20,16 @@ from shapespace.io.landmarks.tps_nts import tps_specimens
 from shapespace.io.parsing import CUT_SHORT, damage_error, is_number, json_value, numeric_text, xml_root
 from shapespace.io.read_limits import LARGEST_LANDMARK_FILE_BYTES
 from shapespace.io.tables.table_io import MISSING, csv_lines, rows_text, unescape_formula
-from shapespace.io.volumes.volume_io import MM_OF_UNITS
+from shapespace.io.volume_io import MM_OF_UNITS
 from shapespace.types import RAS_TO_LPS, FloatArray, SurfaceLandmarks
 
-Pairs = list[tuple[str, FloatArray | None]]
+Pairs: TypeAlias = Iterable[tuple[str, FloatArray | None]]
 """Names and points (3,) in the order of a file; None for a landmark that is marked as absent."""
 # A label names each of its points, so a long one would be there as often as it has points.
 _LONGEST_LABEL = 256
+_VERTEX = "vertex"
+"""Column of regions."""
+_DIGITS = 10  # of the number of a vertex, which fits into int32
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,7 @@ def read_landmarks(path: Path | str, *, keep_absent: bool = False) -> dict[str, 
     """
     path = Path(path)
     read = READ_ONLY_LANDMARKS.get(path.suffix.lower()) or _format(path, "read").read
-    pairs = read(_content(path), path)
+    pairs = list(read(_content(path), path))
     landmarks: dict[str, FloatArray] = {}
     for name, point in pairs:
         if point is None and not keep_absent:
@@ -137,6 +140,30 @@ def read_landmark_indices(path: Path | str) -> dict[str, int]:
             raise damage_error(path, f"it has the name '{row[0][:60]}' twice or empty, so rename it")
         indices[row[0]] = int(row[1])
     return indices
+
+
+def read_region(path: Path | str) -> tuple[int, ...]:
+    """Read vertices, counted from 0: a CSV table with a column `vertex`, or one number in each line; `#` for comments.
+
+    Raises:
+        FileError: it does not exist or cannot be read.
+        FileFormatError: it holds something else, or nothing.
+    """
+    path = Path(path)
+    remedy = "give one vertex number in each line, or a column named vertex"
+    data = read_bytes(path, LARGEST_LANDMARK_FILE_BYTES)
+    try:
+        rows = csv_rows(data, path)
+    except FileFormatError as error:
+        raise FileFormatError(f"{path} is no list of vertices; {remedy}.") from error
+    header = [cell.lower() for cell in rows[0]] if rows else []
+    column = header.index(_VERTEX) if _VERTEX in header else 0
+    cells = [row[column] if column < len(row) else "" for row in (rows[1:] if _VERTEX in header else rows)]
+    wrong = next((cell for cell in cells if not (cell.isascii() and cell.isdecimal() and len(cell) < _DIGITS)), None)
+    if wrong is not None or not cells:
+        problem = "it is empty" if not cells else f"{wrong[:40]!r} is no vertex number" if wrong else "a row has none"
+        raise FileFormatError(f"{path} is no list of vertices ({problem}); {remedy}.")
+    return tuple(int(cell) for cell in cells)
 
 
 _CORNER_COLUMNS = (("vertex", "weight"), ("vertex_2", "weight_2"), ("vertex_3", "weight_3"))
@@ -279,7 +306,7 @@ def _from_json(parse: Callable[[Any, Path], Pairs]) -> Callable[[bytes, Path], P
     def wrapped(data: bytes, path: Path) -> Pairs:
         value = json_value(data, path)
         try:
-            return parse(value, path)
+            return list(parse(value, path))
         except FileError:
             raise
         except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError) as error:
@@ -291,28 +318,19 @@ def _from_json(parse: Callable[[Any, Path], Pairs]) -> Callable[[bytes, Path], P
 def _ljson(value: Any, path: Path) -> Pairs:
     version = value["version"]
     if version == 1:
-        return _ljson_1(value, path)
-    if version == 2:
-        return _ljson_group(value, "", path)
-    if version != 3:
+        for group in value["groups"]:
+            points = [entry["point"] for entry in group["landmarks"]]
+            labels = [{"label": group["label"], "mask": range(len(points))}]
+            yield from _ljson_group({"landmarks": {"points": points}, "labels": labels}, "", path)
+    elif version == 2:
+        yield from _ljson_group(value, "", path)
+    elif version == 3:
+        groups = value["groups"]
+        for name, group in groups.items():
+            _label(name, path)
+            yield from _ljson_group(group, f"{name}_" if len(groups) > 1 else "", path)
+    else:
         raise damage_error(path, f"it is LJSON of version {str(version)[:20]}, but only 1 to 3 are known")
-    groups = value["groups"]
-    out: Pairs = []
-    for name, group in groups.items():
-        _label(name, path)
-        out += _ljson_group(group, f"{name}_" if len(groups) > 1 else "", path)
-    return out
-
-
-def _ljson_1(value: Any, path: Path) -> Pairs:
-    out: Pairs = []
-    for group in value["groups"]:
-        points = [entry["point"] for entry in group["landmarks"]]
-        label = _label(group["label"], path)
-        for i, point in enumerate(points):
-            name = label if len(points) == 1 else f"{label}_{i}"
-            out.append((name, None if _is_missing(point) else _point(point, f"landmark '{name[:60]}'", path)))
-    return out
 
 
 def _ljson_group(group: Any, prefix: str, path: Path) -> Pairs:
@@ -326,11 +344,9 @@ def _ljson_group(group: Any, prefix: str, path: Path) -> Pairs:
             name = label if len(mask) == 1 else f"{label}_{position}"
             names.setdefault(index, prefix + name)
     ordered = [*names, *(i for i in range(len(points)) if i not in names)]
-    out: Pairs = []
     for i in ordered:
         name = names.get(i, f"{prefix}point_{i}")
-        out.append((name, None if _is_missing(points[i]) else _point(points[i], f"landmark '{name[:60]}'", path)))
-    return out
+        yield name, None if _is_missing(points[i]) else _point(points[i], f"landmark '{name[:60]}'", path)
 
 
 def _label(value: Any, path: Path) -> str:
@@ -354,7 +370,6 @@ def _write_ljson(landmarks: Mapping[str, FloatArray]) -> str:
 
 
 def _slicer(value: Any, path: Path) -> Pairs:
-    out: Pairs = []
     for markup in value["markups"]:
         sign = _sign_of_frame(str(markup.get("coordinateSystem", "LPS")), path)
         # One unit, or a list of that of each axis.
@@ -365,9 +380,7 @@ def _slicer(value: Any, path: Path) -> Pairs:
             name = str(entry.get("label") or entry.get("id") or "").strip()
             is_absent = entry.get("positionStatus", "defined") != "defined"
             xyz = None if is_absent else _point(entry["position"], f"landmark '{name[:60]}'", path)
-            point = None if xyz is None else MM_OF_UNITS[unit] * sign * xyz + 0.0
-            out.append((name, point))
-    return out
+            yield name, None if xyz is None else MM_OF_UNITS[unit] * sign * xyz + 0.0
 
 
 def _sign_of_frame(system: str, path: Path) -> FloatArray:
@@ -391,10 +404,12 @@ def slicer_curves(data: bytes, path: Path) -> list[tuple[list[str], bool]]:
     ]
 
 
-def _write_slicer(landmarks: Mapping[str, FloatArray]) -> str:
+def markups_text(landmarks: Mapping[str, FloatArray], descriptions: Mapping[str, str] = MappingProxyType({})) -> str:
+    """Return landmarks in LPS and mm as the text of a file of 3D Slicer, with descriptions by name."""
     points = [
         {"id": str(i), "label": name, "position": _numbers(np.nan_to_num(point)),
-         "positionStatus": "undefined" if np.isnan(point).any() else "defined"}
+         "positionStatus": "undefined" if np.isnan(point).any() else "defined",
+         **({"description": descriptions[name]} if descriptions else {})}
         for i, (name, point) in enumerate(landmarks.items(), start=1)
     ]  # fmt: skip
     schema = (
@@ -432,13 +447,11 @@ def _read_pp(data: bytes, path: Path) -> Pairs:
     root = xml_root(data, path)
     if root.tag != "PickedPoints":
         raise damage_error(path, "it is not a MeshLab file of picked points")
-    out: Pairs = []
     for entry in root.iter("point"):
         name = (entry.get("name") or "").strip()
         is_absent = entry.get("active", "1").strip().lower() in ("0", "false")
         xyz = (entry.get(axis) for axis in "xyz")
-        out.append((name, None if is_absent else _point(xyz, f"landmark '{name[:60]}'", path)))
-    return out
+        yield name, None if is_absent else _point(xyz, f"landmark '{name[:60]}'", path)
 
 
 def _write_pp(landmarks: Mapping[str, FloatArray]) -> str:
@@ -481,7 +494,6 @@ def _read_csv(data: bytes, path: Path) -> Pairs:
         rows = rows[1:]
     elif rows and len(rows[0]) != 4:
         raise damage_error(path, f"its first line has {len(rows[0])} columns, not the four of 'name,x,y,z'")
-    out: Pairs = []
     for row in rows:
         if len(row) <= max(columns):
             raise damage_error(path, f"landmark '{row[0][:60]}' has fewer than 3 coordinates")
@@ -490,8 +502,7 @@ def _read_csv(data: bytes, path: Path) -> Pairs:
             raise damage_error(path, f"{problem}; if it has decimal commas, separate the columns by semicolons")
         is_absent = all(row[c].lower() in MISSING for c in columns)
         xyz = (row[c] for c in columns)
-        out.append((row[0], None if is_absent else _point(xyz, f"landmark '{row[0][:60]}'", path)))
-    return out
+        yield row[0], None if is_absent else _point(xyz, f"landmark '{row[0][:60]}'", path)
 
 
 def _write_csv(landmarks: Mapping[str, FloatArray]) -> str:
@@ -509,14 +520,11 @@ def _number_lines(data: bytes, path: Path) -> list[str]:
 
 
 def _read_bnd(data: bytes, path: Path) -> Pairs:
-    out: Pairs = []
-    for line in filter(None, _number_lines(data, path)):
-        words = line.split()
-        name = f"point_{len(out)}"
+    for k, line in enumerate(filter(None, _number_lines(data, path))):
+        name, words = f"point_{k}", line.split()
         if len(words) != 4 or not words[0].isascii() or not words[0].isdecimal():
             raise damage_error(path, f"{name} is not a row of a vertex number and x y z; it is damaged or cut short")
-        out.append((name, _point(words[1:], name, path)))
-    return out
+        yield name, _point(words[1:], name, path)
 
 
 def _read_lm3(data: bytes, path: Path) -> Pairs:
@@ -549,7 +557,6 @@ def _read_fcsv(data: bytes, path: Path) -> Pairs:
     sign = _sign_of_frame(system, path)
     if not {"x", "y", "z"} <= set(columns):
         raise damage_error(path, "its columns are not those of 3D Slicer's fiducials, so export it again")
-    out: Pairs = []
     for row in csv_rows(data, path):
         entry = dict(zip(columns, row, strict=False))
         name = entry.get("label") or entry.get("id") or ""
@@ -557,8 +564,7 @@ def _read_fcsv(data: bytes, path: Path) -> Pairs:
             raise damage_error(path, f"landmark '{name[:60]}' has {len(row)} cells, perhaps for decimal commas; "
                                "export it again with decimal points")  # fmt: skip
         point = _point((entry.get(axis) for axis in "xyz"), f"landmark '{name[:60]}'", path)
-        out.append((name, sign * point + 0.0))
-    return out
+        yield name, sign * point + 0.0
 
 
 def fcsv_text(landmarks: Mapping[str, FloatArray], descriptions: Mapping[str, str] = MappingProxyType({})) -> str:
@@ -598,13 +604,11 @@ def _read_amira(data: bytes, path: Path) -> Pairs:
 
 
 def _read_tlms(data: bytes, path: Path) -> Pairs:
-    out: Pairs = []
     for line in filter(None, _text_lines(numeric_text(data, path))):
         words = line.split()
         if len(words) != 5 or words[1] not in ("0", "1"):
             raise damage_error(path, "it has a line other than 'name visible x y z', so it is not scalismo's .tlms")
-        out.append((words[0], _point(words[2:], f"landmark '{words[0][:60]}'", path) if words[1] == "1" else None))
-    return out
+        yield words[0], _point(words[2:], f"landmark '{words[0][:60]}'", path) if words[1] == "1" else None
 
 
 _POINTS_HEAD = re.compile(r"version\b.*|n_points\s*:\s*(\d{1,6})|(?:s\s+)?(\d{1,6})|[{}]", re.IGNORECASE)
@@ -612,8 +616,7 @@ _POINTS_HEAD = re.compile(r"version\b.*|n_points\s*:\s*(\d{1,6})|(?:s\s+)?(\d{1,
 
 def _read_points(data: bytes, path: Path) -> Pairs:
     """Read rows `x y z` or `name x y z`, after a count or a header perhaps, as landmark editors save them."""
-    out: Pairs = []
-    declared = None
+    count, declared = 0, None
     for line in _number_lines(data, path):
         row = line.partition("#")[0].strip()
         head = _POINTS_HEAD.fullmatch(row)
@@ -621,24 +624,22 @@ def _read_points(data: bytes, path: Path) -> Pairs:
             declared = int(next(filter(None, head.groups()), 0)) or declared if head else declared
             continue
         words = row.replace(";", " ").split()
-        name = words[0] if len(words) == 4 else f"point_{len(out)}"
-        if not out and not any(map(is_number, words)):
+        name = words[0] if len(words) == 4 else f"point_{count}"
+        if not count and not any(map(is_number, words)):
             continue  # names of columns
         if len(words) not in (3, 4):
             raise damage_error(path, f"{name} is not a row of 'x y z' or 'name x y z' but has {len(words)} columns")
-        out.append((name, _point(words[-3:], f"landmark '{name[:60]}'", path)))
-    if declared is not None and declared != len(out):
-        raise damage_error(
-            path, f"it says {declared} landmarks, but {len(out)} rows follow; it is damaged or cut short"
-        )
-    return out
+        yield name, _point(words[-3:], f"landmark '{name[:60]}'", path)
+        count += 1
+    if declared is not None and declared != count:
+        raise damage_error(path, f"it says {declared} landmarks, but {count} rows follow; it is damaged or cut short")
 
 
 LANDMARK_FORMATS: Mapping[str, LandmarkFormat] = MappingProxyType(
     {
         ".ljson": LandmarkFormat("menpo LJSON", _from_json(_ljson), _write_ljson),
         ".pp": LandmarkFormat("MeshLab picked points", _read_pp, _write_pp),
-        ".mrk.json": LandmarkFormat("3D Slicer markups", _from_json(_slicer), _write_slicer),
+        ".mrk.json": LandmarkFormat("3D Slicer markups", _from_json(_slicer), markups_text),
         ".json": LandmarkFormat("scalismo", _from_json(_any_json), _write_scalismo),
         ".csv": LandmarkFormat("CSV", _read_csv, _write_csv),
         ".fcsv": LandmarkFormat("3D Slicer fiducials", _read_fcsv, fcsv_text),
@@ -658,3 +659,41 @@ READ_ONLY_LANDMARKS: Mapping[str, Callable[[bytes, Path], Pairs]] = MappingProxy
     }
 )
 """File name ending -> reader (content, path) -> names and points, for formats that are not written."""
+
+FIDUCIAL_ENDINGS = (".landmarks.csv", ".landmarks.mrk.json", ".landmarks.fcsv")
+"""Of the files that hold the landmarks of a fit, after NAME."""
+
+Found = Mapping[str, Mapping[str, Any]]
+"""Name -> `at` (x, y, z) in the scan's frame and unit, and `stddev_mm` along its axes, None where it is not known."""
+
+
+def fiducial_texts(fiducials: Found) -> dict[str, str]:
+    """Return ending -> text of each file: a table, and 3D Slicer's two formats, all in the scan's frame and unit.
+
+    Slicer takes the coordinates of a mesh as they are, for LPS and mm, so it shows the points on the scan.
+    """
+    points = {name: np.array(fiducial["at"], dtype=np.float64) for name, fiducial in fiducials.items()}
+    descriptions = {name: _describe(fiducial["stddev_mm"]) for name, fiducial in fiducials.items()}
+    return point_texts(points, descriptions, _table(fiducials))
+
+
+def point_texts(points: Mapping[str, FloatArray], descriptions: Mapping[str, str], table: str) -> dict[str, str]:
+    """Return ending -> text of each file: `table`, and 3D Slicer's two formats of `points` with `descriptions`."""
+    texts = table, markups_text(points, descriptions), fcsv_text(points, descriptions)
+    return dict(zip(FIDUCIAL_ENDINGS, texts, strict=True))
+
+
+def _table(fiducials: Found) -> str:
+    rows = (
+        [name, *_format_numbers(fiducial["at"]), *_format_numbers(fiducial["stddev_mm"])]
+        for name, fiducial in fiducials.items()
+    )
+    return rows_text([["name", *"xyz", *(f"stddev_{axis}_mm" for axis in "xyz")], *rows])
+
+
+def _format_numbers(numbers: Sequence[float] | None) -> list[str]:
+    return [""] * 3 if numbers is None else [repr(float(number)) for number in numbers]
+
+
+def _describe(stddev_mm: Sequence[float] | None) -> str:
+    return "" if stddev_mm is None else f"standard deviation {' '.join(f'{mm:.2f}' for mm in stddev_mm)} mm"

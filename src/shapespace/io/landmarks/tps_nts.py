@@ -24,7 +24,6 @@ from shapespace.io.tables.table_io import MISSING
 from shapespace.reprs import first_names
 from shapespace.types import FloatArray
 
-_NAMED = 3  # specimens in a sentence
 _LEFT_OUT = "="
 """Key of values, which no file has, of specimens with an outline of fewer points than enclose an area."""
 LEAST_OUTLINE = 3  # points that enclose an area
@@ -99,7 +98,7 @@ def parse_tps(text: str, path: Path, curve_points: int | None = None) -> Landmar
     elif len(unscaled) < len(names):
         notes.append(
             f"No coordinates are multiplied by SCALE=, because {len(unscaled)} of {len(names)} specimens have none "
-            f"({first_names(unscaled, _NAMED)}); sizes may differ in unit."
+            f"({first_names(unscaled)}); sizes may differ in unit."
         )
     elif points.shape[2] == 2:
         notes.append("No specimen has SCALE=, so sizes are in the unit of the file, such as pixels.")

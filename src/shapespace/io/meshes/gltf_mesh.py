@@ -6,7 +6,6 @@ trimesh reads glTF too, but it decodes textures, merges by material and reports 
 from __future__ import annotations
 
 import base64
-import binascii
 import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -229,11 +228,9 @@ def _parse(data: bytes, path: Path, build: Callable[[_Gltf], Found]) -> Found:
             raise damage_error(path, "it is not glTF of version 2")
         _refuse_unknown(tree.get("extensionsRequired", []), path)
         return build(_Gltf(path, tree, binary, Allowance(len(data), path)))
-    except (KeyError, IndexError, TypeError, AttributeError, OverflowError, binascii.Error) as error:
-        raise damage_error(path, f"it is not valid glTF; {CUT_SHORT}") from error
-    except ValueError as error:
-        if isinstance(error, (FileError, InputError)):
-            raise
+    except (FileError, InputError):
+        raise
+    except (KeyError, IndexError, TypeError, AttributeError, OverflowError, ValueError) as error:
         raise damage_error(path, f"it is not valid glTF; {CUT_SHORT}") from error
 
 
@@ -301,13 +298,11 @@ def _scene(gltf: _Gltf) -> Mesh:
     faces: list[IndexArray] = []
     n_vertices = 0
     for node, matrix in _nodes_with_meshes(gltf):
-        for vertices, triangles, vertex_colours in _primitives(gltf, node, notes):
+        for vertices, triangles, vertex_colours, _ in _primitives(gltf, node, notes):
             gltf.allowance.take(3 * (len(vertices) + (0 if triangles is None else len(triangles))), 8)
             points.append(vertices @ matrix[:3, :3].T + matrix[:3, 3])
             if triangles is not None:
-                # A mirroring transform turns triangles inside out.
-                mirrored = np.linalg.det(matrix[:3, :3]) < 0
-                faces.append((triangles[:, ::-1] if mirrored else triangles) + n_vertices)
+                faces.append(_outwards(triangles, matrix) + n_vertices)
             colours.append(vertex_colours)
             n_vertices += len(vertices)
     if not points:
@@ -316,6 +311,11 @@ def _scene(gltf: _Gltf) -> Mesh:
     return mesh_of(
         np.concatenate(points), joined, gltf.path, _joined_colours(points, colours), tuple(dict.fromkeys(notes))
     )
+
+
+def _outwards(triangles: IndexArray, matrix: FloatArray) -> IndexArray:
+    """Return triangles (F, 3), turned where a transform (4, 4) is mirroring, which turns them inside out."""
+    return triangles[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else triangles
 
 
 def _joined_colours(points: list[FloatArray], colours: list[ByteArray | None]) -> ByteArray | None:
@@ -340,35 +340,26 @@ def _morphs(gltf: _Gltf) -> Morphs:
     gltf.allowance.part(count)
     # Without its weights, so that what is read is the shape from which the targets are counted.
     parts = _primitives(gltf, {"mesh": node["mesh"], "weights": ()}, [])
-    vertices = np.concatenate([points for points, _, _ in parts])
+    vertices = np.concatenate([points for points, *_ in parts])
     gltf.allowance.take(vertices.size * (count + 1), 8)
     targets = np.zeros((count, len(vertices), 3))
-    n_vertices, visited, faces = 0, set[int](), list[IndexArray]()
-    for primitive in mesh["primitives"]:
-        key = primitive["attributes"]["POSITION"]
-        if primitive.get("mode", _TRIANGLES) not in (_POINTS, _TRIANGLES, _STRIP, _FAN) or key in visited:
-            continue
-        visited.add(key)
-        points, triangles, _ = parts[len(visited) - 1]
+    n_vertices, faces = 0, list[IndexArray]()
+    for points, triangles, _, primitive in parts:
+        end = n_vertices + len(points)
         for k, target in enumerate(primitive.get("targets", ())):
             gltf.allowance.part()
             if "POSITION" in target:
-                targets[k, n_vertices : n_vertices + len(points)] = gltf.accessor(target["POSITION"]).reshape(
-                    len(points), 3
-                )
+                targets[k, n_vertices:end] = gltf.accessor(target["POSITION"]).reshape(len(points), 3)
         if triangles is not None:
-            faces.append(triangles + n_vertices)
-        n_vertices += len(points)
+            faces.append(_outwards(triangles, matrix) + n_vertices)
+        n_vertices = end
     rotation = matrix[:3, :3]
-    joined_faces = np.concatenate(faces) if faces else None
-    if joined_faces is not None and np.linalg.det(rotation) < 0:
-        joined_faces = joined_faces[:, ::-1]
     extras: Any = mesh.get("extras", {})
     names = tuple(map(str, extras.get("targetNames", ()) if isinstance(extras, dict) else ()))  # pyright: ignore[reportUnknownMemberType, reportUnknownArgumentType]
     weights = node.get("weights", mesh.get("weights", []))
     return Morphs(
         vertices=vertices @ rotation.T + matrix[:3, 3],
-        faces=joined_faces,
+        faces=np.concatenate(faces) if faces else None,
         targets=targets @ rotation.T,
         names=names if len(names) == count else (),
         weights=tuple(float(weight) for weight in weights),
@@ -407,12 +398,12 @@ def _local(node: dict[str, Any]) -> FloatArray:
 
 def _primitives(
     gltf: _Gltf, node: dict[str, Any], notes: list[str]
-) -> list[tuple[FloatArray, IndexArray | None, ByteArray | None]]:
-    """Return points, triangles and colours of a node's mesh; primitives that share their positions come as one."""
+) -> list[tuple[FloatArray, IndexArray | None, ByteArray | None, dict[str, Any]]]:
+    """Return points, triangles and colours of a node's mesh, and the first primitive of those that share positions."""
     mesh = gltf.tree["meshes"][node["mesh"]]
     weights = node.get("weights", mesh.get("weights", []))
     vertices: dict[int, FloatArray] = {}
-    colours: dict[int, ByteArray | None] = {}
+    first: dict[int, tuple[ByteArray | None, dict[str, Any]]] = {}
     triangles: dict[int, list[IndexArray]] = {}
     for primitive in mesh["primitives"]:
         gltf.allowance.part()
@@ -428,7 +419,7 @@ def _primitives(
                 if weight and "POSITION" in target:
                     position = position + float(weight) * gltf.accessor(target["POSITION"])
             vertices[key] = position
-            colours[key] = _colours(gltf, primitive, len(position), notes)
+            first[key] = _colours(gltf, primitive, len(position), notes), primitive
         if mode == _POINTS:
             continue
         if "indices" in primitive:
@@ -445,7 +436,7 @@ def _primitives(
         # Checked here: joined, an index past this primitive would point into the next.
         mesh_of(vertices[key], corner_triples, gltf.path)
         triangles.setdefault(key, []).append(corner_triples)
-    return [(v, np.concatenate(triangles[k]) if k in triangles else None, colours[k]) for k, v in vertices.items()]
+    return [(v, np.concatenate(triangles[k]) if k in triangles else None, *first[k]) for k, v in vertices.items()]
 
 
 def _colours(gltf: _Gltf, primitive: dict[str, Any], vertices: int, notes: list[str]) -> ByteArray | None:

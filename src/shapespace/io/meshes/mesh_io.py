@@ -1,9 +1,10 @@
-"""Readers and writers of meshes and point clouds, selected by file name ending from one dict."""
+"""Readers and writers of meshes and point clouds, selected by file name ending from one dict, and lists of them."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 from types import MappingProxyType
@@ -11,21 +12,21 @@ from typing import TypeAlias
 
 import numpy as np
 
-from shapespace.errors import FileFormatError
-from shapespace.io.containers.gzip_files import GZIP, unpack_gzip
-from shapespace.io.files import open_file, read_bytes, read_error, write_bytes
+from shapespace.errors import FileFormatError, InputError
+from shapespace.io.containers.archives import GZIP, unpack_gzip
+from shapespace.io.files import open_file, read_bytes, reading, write_bytes
 from shapespace.io.meshes.bnt import read_bnt
 from shapespace.io.meshes.gltf_mesh import read_gltf, write_glb, write_gltf
 from shapespace.io.meshes.mat_mesh import read_mat_mesh
 from shapespace.io.meshes.obj import read_obj, write_obj
 from shapespace.io.meshes.off import read_off, write_off
-from shapespace.io.meshes.pcd import read_pcd
 from shapespace.io.meshes.ply import probe_ply, read_ply, write_ply
+from shapespace.io.meshes.point_clouds import read_pcd, read_xyz
 from shapespace.io.meshes.stl import probe_stl, read_stl, write_stl
 from shapespace.io.meshes.vrml import read_vrml
 from shapespace.io.meshes.vtk import read_vtk, write_vtk, write_vtp
-from shapespace.io.meshes.xyz import read_xyz
 from shapespace.io.read_limits import LARGEST_MESH_FILE_BYTES
+from shapespace.reprs import first_names
 from shapespace.types import Mesh, require
 
 _PACKED = ".gz"
@@ -38,6 +39,13 @@ _CONVERT: Mapping[str, str] = {
     ".raw": "convert a mesh to PLY, a volume to NRRD or NIfTI",
 }
 """File name ending -> what to do with a file that is not read."""
+_LEFT_OUT: Mapping[str, tuple[str, str, str, str]] = {
+    "folder": ("folder", "folders", "looked into", "--recursive takes the {} there"),
+    "linked": ("link to a folder", "links to folders", "followed", "give that folder too"),
+    "broken": ("broken link", "broken links", "taken", "mend or remove it"),
+    "packed": ("compressed file", "compressed files", "taken", "unpack them with gunzip first"),
+}
+"""Kind of what is not taken from a folder -> one, several, what is not done with them, and advice."""
 
 
 @dataclass(frozen=True)
@@ -106,11 +114,8 @@ def probe_mesh(path: Path) -> None:
     ending = ending_of(path)
     if ending not in READ_ONLY_FORMATS and ending not in NAMED_FORMATS:
         _format(path, "read")
-    with open_file(path) as stream:
-        try:
-            size, head = os.fstat(stream.fileno()).st_size, stream.read(_PROBED_BYTES)
-        except OSError as error:
-            raise read_error(path, error) from error
+    with open_file(path) as stream, reading(path):
+        size, head = os.fstat(stream.fileno()).st_size, stream.read(_PROBED_BYTES)
     if size > LARGEST_MESH_FILE_BYTES:
         read_bytes(path, LARGEST_MESH_FILE_BYTES)  # refuses it
     if not head.strip():
@@ -196,3 +201,86 @@ MESH_ENDINGS = (*MESH_FORMATS, *READ_ONLY_FORMATS)
 
 MESH_FILE_ENDINGS = (*MESH_ENDINGS, *(f"{ending}{_PACKED}" for ending in MESH_ENDINGS))
 """With those of files packed by gzip."""
+
+
+@dataclass(frozen=True)
+class MeshFiles:
+    """Result of `mesh_files`.
+
+    Args:
+        files: in the order given, those of a folder in the order of their names.
+        left_out: a sentence for each kind of thing that was not taken.
+    """
+
+    files: tuple[Path, ...]
+    left_out: tuple[str, ...]
+
+
+def mesh_files(
+    paths: Sequence[Path],
+    *,
+    recursive: bool = False,
+    apart_from: Path | None = None,
+    endings: Sequence[str] = MESH_FILE_ENDINGS,
+    kind_name: str = "meshes",
+) -> MeshFiles:
+    """Return `paths` with each folder replaced by the meshes in it, or by other files of some kind.
+
+    Args:
+        paths: files, taken as they are, and folders.
+        recursive: whether to take what lies in folders below these too. Links to folders are not followed.
+        apart_from: a folder below that is not looked into, such as that of the results.
+        endings: of the files to take, in small letters.
+        kind_name: they are called.
+
+    Raises:
+        InputError: a folder without meshes.
+        FileError: a folder that cannot be read.
+    """
+    files: list[Path] = []
+    left_out: list[str] = []
+    for path in paths:
+        with reading(path):
+            is_folder = path.is_dir()
+        if not is_folder:
+            files.append(path)
+            continue
+        found: dict[str, list[Path]] = defaultdict(list)
+        apart = None if apart_from is None else apart_from.resolve()
+        for kind, entry in _entries(path, tuple(endings), recursive, apart):
+            found[kind].append(entry)
+        if not found["file"]:
+            advice = "; give --recursive for what lies in the folders below it" if found["folder"] else ""
+            advice += "; unpack those that are compressed with gunzip" if found["packed"] else ""
+            known = MESH_ENDINGS if endings is MESH_FILE_ENDINGS else endings
+            raise InputError(f"{path} holds no {kind_name}{advice}; shapespace reads {', '.join(known)}.")
+        files += found["file"]
+        for kind, (singular, plural, verb, advice) in _LEFT_OUT.items():
+            if names := [entry.relative_to(path).as_posix() for entry in found[kind]]:
+                count_words = f"1 {singular} is" if len(names) == 1 else f"{len(names)} {plural} are"
+                shown = f"({first_names(names)}); {advice.format(kind_name)}"
+                left_out.append(f"{path}: {count_words} not {verb} {shown}.")
+    return MeshFiles(tuple(files), tuple(left_out))
+
+
+def _entries(
+    folder: Path, endings: tuple[str, ...], recursive: bool, apart_from: Path | None
+) -> Iterator[tuple[str, Path]]:
+    """Yield the files to take from a folder, as `file`, and what is left out, as a kind of `_LEFT_OUT`, by name."""
+    packed_endings = tuple(f"{ending}{_PACKED}" for ending in endings)
+    with reading(folder):
+        for path in sorted(p for p in folder.iterdir() if not p.name.startswith(".")):
+            is_of_kind = path.name.lower().endswith(endings)
+            if path.is_dir():
+                if path.resolve() == apart_from:
+                    continue
+                if recursive and not path.is_symlink():
+                    yield from _entries(path, endings, recursive, apart_from)
+                else:
+                    yield "linked" if recursive else "folder", path
+            elif is_of_kind and path.is_file():
+                yield "file", path
+            elif path.name.lower().endswith(packed_endings):
+                yield "packed", path
+            elif path.is_symlink() and not path.exists() and (is_of_kind or not path.suffix):
+                yield "broken", path

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterator
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -17,6 +17,7 @@ from shapespace.io.parsing import (
     CUT_SHORT,
     SPACE,
     IndexArray,
+    WordCursor,
     bytes_of_colours,
     check_count,
     damage_error,
@@ -27,7 +28,6 @@ from shapespace.io.parsing import (
     mesh_of,
     numeric_text,
     plain_text,
-    word_block,
 )
 from shapespace.types import BoolArray, ByteArray, FloatArray, Mesh
 
@@ -38,6 +38,7 @@ _SCALARS = {
     "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
     "int64": "i8", "uint64": "u8",
 }  # fmt: skip
+_FLOATS = {"f4", "f8"}
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _MAX_HEADER = 1 << 20  # bytes (1 MiB)
 _FIRST_LINES = 512  # bytes that hold the comment
@@ -68,65 +69,12 @@ class _Element:
 
     def index_list(self) -> int | None:
         """Where the list of corners is among the properties."""
-        for i, p in enumerate(self.properties):
-            if p.count is not None and p.name in _INDEX_LISTS:
-                return i
-        return None
+        places = (i for i, p in enumerate(self.properties) if p.count is not None and p.name in _INDEX_LISTS)
+        return next(places, None)
 
-
-class _Words:
-    """Iterator over the words of ascii data from an offset; few words are in memory at a time."""
-
-    def __init__(self, data: bytes, offset: int) -> None:
-        self.data = data
-        self.begin = self.end = offset
-        self.block: list[bytes] = []
-        self.position = 0
-
-    @property
-    def left(self) -> int:
-        """Bytes from the block of the next word on, and one for the space that the last does without."""
-        return len(self.data) - self.begin + 1
-
-    def mark(self) -> tuple[int, int, list[bytes], int]:
-        """Return where the next word is, for `back_to`."""
-        return self.begin, self.end, self.block, self.position
-
-    def back_to(self, mark: tuple[int, int, list[bytes], int]) -> None:
-        """Go back to where `mark` was taken."""
-        self.begin, self.end, self.block, self.position = mark
-
-    def __iter__(self) -> Iterator[bytes]:
-        return self
-
-    def __next__(self) -> bytes:
-        while self.position == len(self.block):
-            if self.end >= len(self.data):
-                raise StopIteration
-            self.begin, self.position = self.end, 0
-            self.block, self.end = word_block(self.data, self.begin)
-        self.position += 1
-        return self.block[self.position - 1]
-
-    def take(self, count: int) -> Iterator[list[bytes]]:
-        """Yield the next `count` words in lists; fewer where the text ends."""
-        while count > 0 and (word := next(self, None)) is not None:
-            part = [word, *self.block[self.position : self.position + count - 1]]
-            self.position += len(part) - 1
-            count -= len(part)
-            yield part
-
-    def some(self, count: int) -> list[bytes]:
-        """Return the next `count` words; fewer where the text ends."""
-        part = self.block[self.position : self.position + count]
-        self.position += len(part)
-        # The rest of a long list lies in the blocks that follow.
-        return part if len(part) == count else [*part, *chain.from_iterable(self.take(count - len(part)))]
-
-    def skip(self, count: int) -> None:
-        """Pass `count` words."""
-        for _ in self.take(count):
-            pass
+    def kinds(self, *names: str) -> set[str]:
+        """Return the types of the properties with one of the names."""
+        return {p.item for p in self.properties if p.name in names}
 
 
 def read_ply(data: bytes, path: Path) -> Mesh:
@@ -143,52 +91,39 @@ def read_ply(data: bytes, path: Path) -> Mesh:
     data = plain_text(data)
     order, elements, offset = _header(data, path)
     header = data[:offset]
-    if order == "":
-        data = numeric_text(data, path, offset)
-    vertices: FloatArray | None = None
-    colours: ByteArray | None = None
-    observed: BoolArray | None = None
-    std: FloatArray | None = None
+    data = data if order else numeric_text(data, path, offset)
+    vertices: _Vertices | None = None
     faces: IndexArray | None = None
-    words = _Words(data, offset)
+    is_text, cursor = order == "", WordCursor(data, path, offset)
     for element in elements:
         if element.name == "tristrips":
             raise damage_error(path, "it holds triangle strips, so export it again with plain triangles")
-        available = words.left if order == "" else len(data) - offset
-        check_count(element.count, element.least_bytes(order == ""), available, _plural(element.name), path)
-        lists = any(p.count is not None for p in element.properties)
-        list_index = None
-        if element.name == "face" and element.count:
-            list_index = element.index_list()
-            if list_index is None:
-                raise damage_error(path, "its faces have no property vertex_indices, so export it again")
-        if lists and order == "":
-            counts, corners = _ascii_lists(words, element, list_index, path)
-        elif lists:
-            counts, corners, offset = _binary_lists(data, offset, element, order, list_index, path)
+        available = cursor.left if is_text else len(data) - cursor.position
+        check_count(element.count, element.least_bytes(is_text), available, _plural(element.name), path)
+        has_faces = element.name == "face" and element.count > 0
+        list_index = element.index_list() if has_faces else None
+        if has_faces and list_index is None:
+            raise damage_error(path, "its faces have no property vertex_indices, so export it again")
+        if any(p.count is not None for p in element.properties):
+            read_lists = _ascii_lists if is_text else _binary_lists
+            counts, corners = read_lists(cursor, element, order, list_index)
+            if element.name == "vertex":
+                raise damage_error(path, "its vertices carry lists, so export it again without them")
+            if list_index is not None:
+                if len(counts) and counts.min() < 0:
+                    raise damage_error(path, f"a face has {int(counts.min())} corners; {CUT_SHORT}")
+                faces = fan_triangles(counts, corners)
+        elif element.name == "vertex":
+            vertices = _read_vertices(cursor, element, order)
+        elif is_text:
+            for _ in cursor.words(element.count * len(element.properties)):
+                pass
         else:
-            positions = element.name == "vertex"
-            if positions:
-                _refuse_without_xyz(element, path)
-            if order == "":
-                if positions:
-                    vertices, colours, observed, std = _ascii_vertices(words, element, path)
-                else:
-                    words.skip(element.count * len(element.properties))
-            else:
-                if positions:
-                    vertices, colours, observed, std = _binary_vertices(data, offset, element, order)
-                offset += element.count * element.least_bytes(False)
-            continue
-        if element.name == "vertex":
-            raise damage_error(path, "its vertices carry lists, so export it again without them")
-        if list_index is not None:
-            if len(counts) and counts.min() < 0:
-                raise damage_error(path, f"a face has {int(counts.min())} corners; {CUT_SHORT}")
-            faces = fan_triangles(counts, corners)
+            cursor.position += element.count * element.least_bytes(False)
     if vertices is None:
         raise damage_error(path, "its header declares no vertices")
-    return mesh_of(vertices, faces, path, colours, observed=observed, position_std=std, header=header)
+    positions, colours, observed, std = vertices
+    return mesh_of(positions, faces, path, colours, observed=observed, position_std=std, header=header)
 
 
 def probe_ply(head: bytes, size: int, path: Path) -> None:
@@ -252,179 +187,162 @@ def _header(data: bytes, path: Path) -> tuple[str, list[_Element], int]:
     return order, elements, start
 
 
-def _refuse_without_xyz(element: _Element, path: Path) -> None:
-    if not set("xyz") <= {p.name for p in element.properties}:
-        raise damage_error(path, "its vertices have no x, y and z")
+_Vertices: TypeAlias = tuple[FloatArray, ByteArray | None, BoolArray | None, FloatArray | None]
+"""Positions (V, 3), colours (V, 3), mask (V,) of observed vertices, and `Mesh.position_std` (V,)."""
 
 
-def _colour_names(names: list[str]) -> tuple[str, ...]:
-    return next((three for three in _COLOURS if set(three) <= set(names)), ())
+def _read_vertices(cursor: WordCursor, element: _Element, order: str) -> _Vertices:
+    """Return what is known of the vertices; a mask is whole numbers, and `position_std` finite lengths."""
+    names = [p.name for p in element.properties]
+    if not set("xyz") <= set(names):
+        raise damage_error(cursor.path, "its vertices have no x, y and z")
+    three = next((three for three in _COLOURS if set(three) <= set(names)), ())
+    flags = [name for name in (_OBSERVED, _POSITION_STD) if name in names]
+    read_columns = _binary_columns if order else _ascii_columns
+    columns = read_columns(
+        cursor, element, order, {name: names.index(name) for name in ("x", "y", "z", *three, *flags)}
+    )
+    positions = np.stack([columns[axis] for axis in "xyz"], axis=1, dtype=np.float64)
+    colours = _colours(np.stack([columns[name] for name in three], axis=1), element.kinds(*three)) if three else None
+    mask, std = columns.get(_OBSERVED), columns.get(_POSITION_STD)
+    observed = None if mask is None or element.kinds(_OBSERVED) & _FLOATS else np.asarray(mask != 0)
+    is_float = bool(element.kinds(_POSITION_STD) & _FLOATS)
+    is_length = std is not None and is_float and np.isfinite(std).all() and (std >= 0).all()
+    return positions, colours, observed, np.asarray(std, dtype=np.float64) if is_length else None
 
 
-def _colours(element: _Element, columns: dict[str, npt.NDArray[Any]]) -> ByteArray | None:
-    """Return colours (V, 3) from their columns, as the types of their properties say."""
-    three = _colour_names([p.name for p in element.properties])
-    if not three:
-        return None
-    kinds = {p.item for p in element.properties if p.name in three}
-    values = np.stack([columns[name] for name in three], axis=1)
+def _colours(values: npt.NDArray[Any], kinds: set[str]) -> ByteArray | None:
+    """Return colours (V, 3), as the types of their properties say."""
     # The type tells what white is, of dark scans too.
     if kinds == {"u1"}:
         return values.astype(np.uint8) if ((values >= 0) & (values <= 255)).all() else None
     return bytes_of_colours(values)
 
 
-_Vertices: TypeAlias = tuple[FloatArray, ByteArray | None, BoolArray | None, FloatArray | None]
-"""Positions (V, 3), colours (V, 3), mask (V,) of observed vertices, and `Mesh.position_std` (V,)."""
-
-
-def _is_observed(element: _Element, column: npt.NDArray[Any] | None) -> BoolArray | None:
-    """Return the mask (V,) of observed vertices; None unless the property holds whole numbers."""
-    kinds = {p.item[0] for p in element.properties if p.name == _OBSERVED}
-    return None if column is None or "f" in kinds else np.asarray(column != 0)
-
-
-def _position_std(element: _Element, column: npt.NDArray[Any] | None) -> FloatArray | None:
-    """Return standard deviations (V,) of positions; None unless the property has finite lengths."""
-    kinds = {p.item[0] for p in element.properties if p.name == _POSITION_STD}
-    is_length = column is not None and "f" in kinds and np.isfinite(column).all() and (column >= 0).all()
-    return np.asarray(column, dtype=np.float64) if is_length else None
-
-
-def _binary_vertices(data: bytes, offset: int, element: _Element, order: str) -> _Vertices:
-    names = [p.name for p in element.properties]
+def _binary_columns(
+    cursor: WordCursor, element: _Element, order: str, places: Mapping[str, int]
+) -> dict[str, npt.NDArray[Any]]:
     row = np.dtype([(f"p{i}", order + p.item) for i, p in enumerate(element.properties)])
-    table = np.frombuffer(data, dtype=row, count=element.count, offset=offset)
-    out = np.empty((element.count, 3), dtype=np.float64)
-    for axis, name in enumerate("xyz"):
-        out[:, axis] = table[f"p{names.index(name)}"]
-    colours = _colours(element, {name: table[f"p{names.index(name)}"] for name in _colour_names(names)})
-    mask, std = (table[f"p{names.index(n)}"] if n in names else None for n in (_OBSERVED, _POSITION_STD))
-    return out, colours, _is_observed(element, mask), _position_std(element, std)
+    table = np.frombuffer(cursor.data, dtype=row, count=element.count, offset=cursor.position)
+    cursor.position += table.nbytes
+    return {name: table[f"p{place}"] for name, place in places.items()}
 
 
-def _ascii_vertices(words: _Words, element: _Element, path: Path) -> _Vertices:
-    names = [p.name for p in element.properties]
-    width = len(names)
-    flags = [name for name in (_OBSERVED, _POSITION_STD) if name in names]
-    columns: dict[str, list[FloatArray]] = {name: [] for name in ("x", "y", "z", *_colour_names(names), *flags)}
-    n_read = 0
-    for part in words.take(element.count * width):
-        for axis, parts in columns.items():
+def _ascii_columns(
+    cursor: WordCursor, element: _Element, _order: str, places: Mapping[str, int]
+) -> dict[str, npt.NDArray[Any]]:
+    width, n_read = len(element.properties), 0
+    columns: dict[str, list[FloatArray]] = {name: [] for name in places}
+    for part in cursor.words(element.count * width):
+        for name, place in places.items():
             # A part may begin and end anywhere in a row.
-            parts.append(floats(part[(names.index(axis) - n_read) % width :: width], path))
+            columns[name].append(floats(part[(place - n_read) % width :: width], cursor.path))
         n_read += len(part)
     if n_read < element.count * width:
-        raise _truncation_error(element, path)
-    arrays = {name: join_parts(parts, np.float64) for name, parts in columns.items()}
-    positions = np.stack([arrays[axis] for axis in "xyz"], axis=1)
-    mask, std = _is_observed(element, arrays.get(_OBSERVED)), _position_std(element, arrays.get(_POSITION_STD))
-    return positions, _colours(element, arrays), mask, std
+        raise _truncation_error(element, cursor.path)
+    return {name: join_parts(parts, np.float64) for name, parts in columns.items()}
 
 
 def _truncation_error(element: _Element, path: Path) -> FileFormatError:
     return damage_error(path, f"it ends among its {_plural(element.name)}; {CUT_SHORT}")
 
 
-def _ascii_lists(words: _Words, element: _Element, list_index: int | None, path: Path) -> tuple[IndexArray, IndexArray]:
+def _ascii_lists(
+    cursor: WordCursor, element: _Element, _order: str, list_index: int | None
+) -> tuple[IndexArray, IndexArray]:
     if len(element.properties) == 1 and element.count and list_index == 0:
-        table = _read_equal_lists(words, element.count, path)
+        table = _read_equal_lists(cursor, element.count)
         if table is not None:
             return table[:, 0], table[:, 1:].ravel()
     sizes, corners = array("q"), array("q")
     try:
         for _ in range(element.count):
             for i, p in enumerate(element.properties):
-                if p.count is None:
-                    next(words)
-                    continue
-                size = int(next(words))
-                if size < 0:
-                    raise StopIteration
-                part = words.some(size)
-                if len(part) < size:
-                    raise StopIteration
+                word = cursor.word()
+                size = int(word) if word and p.count is not None else 0
+                part = [*chain.from_iterable(cursor.words(size))]
+                if not word or len(part) != size:
+                    raise _truncation_error(element, cursor.path)
                 if i == list_index:
                     sizes.append(size)
                     corners.extend(map(int, part))
+    except FileFormatError:
+        raise
     except (ValueError, OverflowError) as error:
-        raise damage_error(path, f"a list has no whole number where one should be; {CUT_SHORT}") from error
-    except StopIteration as error:
-        raise _truncation_error(element, path) from error
+        raise damage_error(cursor.path, f"a list has no whole number where one should be; {CUT_SHORT}") from error
     return np.array(sizes, dtype=np.int64), np.array(corners, dtype=np.int64)
 
 
-def _read_equal_lists(words: _Words, count: int, path: Path) -> IndexArray | None:
+def _read_equal_lists(cursor: WordCursor, count: int) -> IndexArray | None:
     """Return (count, n + 1) the sizes and corners of lists of equal length; None if their lengths differ."""
-    start = words.mark()
-    first = next(words, b"")
-    size = int(ints([first], path)[0])
-    words.back_to(start)
-    if size <= 0 or count * (size + 1) * 2 > words.left:
+    start = cursor.position
+    first = cursor.word()
+    size = int(ints([first], cursor.path)[0])
+    cursor.position = start
+    if size <= 0 or count * (size + 1) * 2 > cursor.left:
         return None
     n_read = 0
     parts: list[IndexArray] = []
-    for part in words.take(count * (size + 1)):
+    for part in cursor.words(count * (size + 1)):
         lengths = part[-n_read % (size + 1) :: size + 1]
         if lengths.count(first) != len(lengths):
             break
-        parts.append(ints(part, path))
+        parts.append(ints(part, cursor.path))
         n_read += len(part)
     if n_read == count * (size + 1):
         return np.concatenate(parts).reshape(count, size + 1)
-    words.back_to(start)
+    cursor.position = start
     return None
 
 
 def _binary_lists(
-    data: bytes, offset: int, element: _Element, order: str, list_index: int | None, path: Path
-) -> tuple[IndexArray, IndexArray, int]:
+    cursor: WordCursor, element: _Element, order: str, list_index: int | None
+) -> tuple[IndexArray, IndexArray]:
     none = np.zeros(0, dtype=np.int64)
     if element.count == 0:
-        return none, none, offset
+        return none, none
     if any(p.count is not None and p.count[0] == "f" for p in element.properties):
-        raise damage_error(path, "a list has a length that is not a whole number, so export it again")
-    uniform = _uniform_lists(data, offset, element, order, list_index)
+        raise damage_error(cursor.path, "a list has a length that is not a whole number, so export it again")
+    uniform = _uniform_lists(cursor, element, order, list_index)
     if uniform is not None:
         return uniform
     endian = "little" if order == "<" else "big"
-    plan: list[tuple[int, int, bool, bool]] = []
-    for i, p in enumerate(element.properties):
-        count_bytes = 0 if p.count is None else np.dtype(p.count).itemsize
-        signed = p.count is not None and p.count[0] == "i"
-        plan.append((count_bytes, np.dtype(p.item).itemsize, signed, i == list_index))
-    starts, sizes = array("q"), array("q")
+    plan = [
+        (
+            np.dtype(p.count).itemsize if p.count else 0,
+            np.dtype(p.item).itemsize,
+            p.count is not None and p.count[0] == "i",
+            i == list_index,
+        )
+        for i, p in enumerate(element.properties)
+    ]
+    data, offset = cursor.data, cursor.position
+    sizes, corners = array("q"), bytearray()
     for _ in range(element.count):
-        for count_bytes, item, signed, keep in plan:
-            if count_bytes == 0:
-                offset += item
-                continue
-            size = int.from_bytes(data[offset : offset + count_bytes], endian, signed=signed)
+        for count_bytes, item_bytes, signed, is_kept in plan:
+            size = int.from_bytes(data[offset : offset + count_bytes], endian, signed=signed) if count_bytes else 1
             offset += count_bytes
-            if keep:
-                starts.append(offset)
+            end = offset + max(size, 0) * item_bytes
+            if is_kept:
                 sizes.append(size)
-            offset += max(size, 0) * item
+                corners += data[offset:end]
+            offset = end
         if offset > len(data):
-            raise damage_error(path, f"it ends among its {_plural(element.name)}; {CUT_SHORT}")
+            raise _truncation_error(element, cursor.path)
+    cursor.position = offset
     if list_index is None:
-        return none, none, offset
-    kind = np.dtype(order + element.properties[list_index].item)
-    counts = np.array(sizes, dtype=np.int64)
-    lengths = np.maximum(counts, 0)
-    step = np.arange(int(lengths.sum()), dtype=np.int64) - np.repeat(np.cumsum(lengths) - lengths, lengths)
-    first_byte = np.repeat(np.array(starts, dtype=np.int64), lengths) + step * kind.itemsize
-    raw = np.frombuffer(data, dtype=np.uint8)[first_byte[:, None] + np.arange(kind.itemsize)]
-    return counts, _indices(np.ascontiguousarray(raw).view(kind).ravel()), offset
+        return none, none
+    kind = order + element.properties[list_index].item
+    return np.array(sizes, dtype=np.int64), _indices(np.frombuffer(corners, kind))
 
 
 def _uniform_lists(
-    data: bytes, start: int, element: _Element, order: str, list_index: int | None
-) -> tuple[IndexArray, IndexArray, int] | None:
+    cursor: WordCursor, element: _Element, order: str, list_index: int | None
+) -> tuple[IndexArray, IndexArray] | None:
     """Read all rows at once if all lists have the lengths of the first row; None otherwise."""
     fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
     expected: list[tuple[str, int]] = []
-    offset = start
+    data, offset = cursor.data, cursor.position
     for i, p in enumerate(element.properties):
         if p.count is None:
             fields.append((f"p{i}", order + p.item))
@@ -441,15 +359,16 @@ def _uniform_lists(
         expected.append((f"c{i}", size))
         offset += size * np.dtype(p.item).itemsize
     row = np.dtype(fields)
-    end = start + element.count * row.itemsize
+    end = cursor.position + element.count * row.itemsize
     if end > len(data):
         return None
-    table = np.frombuffer(data, dtype=row, count=element.count, offset=start)
+    table = np.frombuffer(data, dtype=row, count=element.count, offset=cursor.position)
     if any((table[name] != size).any() for name, size in expected):
         return None
+    cursor.position = end
     if list_index is None:
-        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), end
-    return table[f"c{list_index}"].astype(np.int64), _indices(table[f"p{list_index}"].ravel()), end
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    return table[f"c{list_index}"].astype(np.int64), _indices(table[f"p{list_index}"].ravel())
 
 
 def _indices(values: npt.NDArray[Any]) -> IndexArray:

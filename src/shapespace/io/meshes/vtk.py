@@ -9,7 +9,6 @@ import base64
 import re
 import xml.etree.ElementTree as ET
 import zlib
-from abc import ABC, abstractmethod
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +22,7 @@ from shapespace.io.parsing import (
     CUT_SHORT,
     SPACE,
     IndexArray,
+    WordCursor,
     check_count,
     damage_error,
     fan_triangles,
@@ -36,7 +36,6 @@ from shapespace.io.parsing import (
     numeric_text,
     plain_text,
     strip_triangles,
-    word_block,
     xml_root,
 )
 from shapespace.io.read_limits import Allowance
@@ -56,7 +55,6 @@ _XML = {
 _TEXTS = ("string", "utf8_string")
 _LINES = ("variant",)
 _BITS = ("bit",)
-_WORD = re.compile(rb"\s*(\S+)[ \t]*\r?\n?")
 _OFFSETS = re.compile(rb"\s*OFFSETS\s")
 _BLANK_LINE = re.compile(rb"\n[ \t\r]*\n")
 # zlib cannot shrink by more than this (1032 : 1), so a header that promises more lies.
@@ -73,31 +71,52 @@ Cells: TypeAlias = tuple[IndexArray, IndexArray]
 """Numbers of corners of cells, and their corners one after another."""
 
 
-class _Cursor(ABC):
-    """Read position in a legacy file, with words read here and numbers by the ascii or binary subclass."""
+class _Cursor(WordCursor):
+    """Read position in a legacy file, whose words are text and whose numbers are text or binary.
 
-    def __init__(self, data: bytes, path: Path) -> None:
-        self.data, self.position, self.path = data, 0, path
+    Args:
+        data: the file after its header.
+        path: for messages.
+        is_text: whether numbers are text.
+    """
 
-    def word(self) -> bytes:
-        """Return the next word, or nothing at the end."""
-        match = _WORD.match(self.data, self.position)
-        if match is None:
-            return b""
-        self.position = match.end()
-        return match[1]
+    def __init__(self, data: bytes, path: Path, is_text: bool) -> None:
+        super().__init__(data, path)
+        self.is_text = is_text
 
-    @abstractmethod
     def array(self, count: int, kind: str) -> Values:
         """Return the next `count` numbers of the numpy `kind`."""
+        if self.is_text:
+            check_count(count, 2, len(self.data) - self.position + 1, "numbers", self.path)
+            read = floats if kind[0] == "f" else ints
+            parts = [read(words, self.path) for words in self.words(count)]
+            if sum(map(len, parts)) < count:
+                raise damage_error(self.path, f"it ends among its numbers; {CUT_SHORT}")
+            return join_parts(parts, np.float64 if kind[0] == "f" else np.int64)
+        big = np.dtype(">" + kind)
+        check_count(count, big.itemsize, len(self.data) - self.position, "numbers", self.path)
+        values = np.frombuffer(self.data, dtype=big, count=count, offset=self.position)
+        self.position += count * big.itemsize
+        return values.astype(np.float64 if kind[0] == "f" else np.int64)
 
-    @abstractmethod
     def skip_texts(self, count: int) -> None:
         """Move past `count` pieces of text."""
+        if self.is_text:
+            self.skip_lines(count)
+            return
+        check_count(count, 1, len(self.data) - self.position, "pieces of text", self.path)
+        for _ in range(count):
+            # The two highest bits of the length tell how many bytes it has.
+            width = 8 >> (self.data[self.position] >> 6) if self.position < len(self.data) else 1
+            prefix = self.data[self.position : self.position + width]
+            length = int.from_bytes(prefix, "big") & ((1 << (8 * width - 2)) - 1)
+            self.position += width + length
+            if self.position > len(self.data):
+                raise damage_error(self.path, f"it ends among its fields; {CUT_SHORT}")
 
-    @abstractmethod
     def skip_bits(self, count: int) -> None:
         """Move past `count` bits."""
+        self.array(count if self.is_text else -(-count // 8), "u1")
 
     def skip_lines(self, count: int) -> None:
         """Move past `count` lines, which are text in binary files too."""
@@ -122,52 +141,17 @@ class _Cursor(ABC):
         self.position = match.end() if match else self.position
         return match is not None
 
+    def count(self) -> int:
+        """Return the next word as a whole number."""
+        return int(ints([self.word()], self.path)[0])
 
-class _TextCursor(_Cursor):
-    def array(self, count: int, kind: str) -> Values:
-        check_count(count, 2, len(self.data) - self.position + 1, "numbers", self.path)
-        parts: list[Values] = []
-        while count:
-            words, stop = word_block(self.data, self.position, 16 * count)
-            if not words and stop == len(self.data):
-                raise damage_error(self.path, f"it ends among its numbers; {CUT_SHORT}")
-            if len(words) > count:
-                # Cut again, to see where the last of them ends.
-                remainder = self.data[self.position : stop].split(None, count)[count]
-                words, stop = words[:count], stop - len(remainder)
-            parts.append(floats(words, self.path) if kind[0] == "f" else ints(words, self.path))
-            self.position = stop
-            count -= len(words)
-        return join_parts(parts, np.float64 if kind[0] == "f" else np.int64)
+    def kind(self) -> str:
+        """Return the numpy kind of the next word, the name of a type."""
+        return _kind(self.lower_word(), self.path)
 
-    def skip_texts(self, count: int) -> None:
-        self.skip_lines(count)
-
-    def skip_bits(self, count: int) -> None:
-        self.array(count, "i1")
-
-
-class _BinaryCursor(_Cursor):
-    def array(self, count: int, kind: str) -> Values:
-        big = np.dtype(">" + kind)
-        check_count(count, big.itemsize, len(self.data) - self.position, "numbers", self.path)
-        values = np.frombuffer(self.data, dtype=big, count=count, offset=self.position)
-        self.position += count * big.itemsize
-        return values.astype(np.float64 if kind[0] == "f" else np.int64)
-
-    def skip_texts(self, count: int) -> None:
-        check_count(count, 1, len(self.data) - self.position, "pieces of text", self.path)
-        for _ in range(count):
-            # The two highest bits of the length tell how many bytes it has.
-            width = 8 >> (self.data[self.position] >> 6) if self.position < len(self.data) else 1
-            prefix = self.data[self.position : self.position + width]
-            length = int.from_bytes(prefix, "big") & ((1 << (8 * width - 2)) - 1)
-            self.position += width + length
-            if self.position > len(self.data):
-                raise damage_error(self.path, f"it ends among its fields; {CUT_SHORT}")
-
-    def skip_bits(self, count: int) -> None:
-        self.array(-(-count // 8), "u1")
+    def lower_word(self) -> str:
+        """Return the next word in lower case."""
+        return self.word().decode("ascii", "replace").lower()
 
 
 def read_vtk(data: bytes, path: Path) -> Mesh:
@@ -239,13 +223,10 @@ def _read_legacy(data: bytes, path: Path) -> tuple[Mesh, list[Cells]]:
     encoding = head[2].strip().upper()
     body = data[sum(len(line) + 1 for line in head[:3]) :]
     allowance = Allowance(len(data), path)
-    cursor: _Cursor
-    if encoding == b"ASCII":
-        cursor = _TextCursor(numeric_text(data, path, len(data) - len(body))[len(data) - len(body) :], path)
-    elif encoding == b"BINARY":
-        cursor = _BinaryCursor(body, path)
-    else:
+    if encoding not in (b"ASCII", b"BINARY"):
         raise damage_error(path, "its third line says neither ASCII nor BINARY")
+    is_text, start = encoding == b"ASCII", len(data) - len(body)
+    cursor = _Cursor(numeric_text(data, path, start)[start:] if is_text else body, path, is_text)
     dataset = cursor.word() + b" " + cursor.word()
     if dataset != b"DATASET POLYDATA":
         kind = dataset.decode("ascii", "replace")[:40]
@@ -256,8 +237,8 @@ def _read_legacy(data: bytes, path: Path) -> tuple[Mesh, list[Cells]]:
     while (word := cursor.word()) not in (b"", b"POINT_DATA", b"CELL_DATA"):
         allowance.part()
         if word == b"POINTS":
-            count = _count(cursor, path)
-            vertices = cursor.array(3 * count, _next_kind(cursor, path)).astype(np.float64).reshape(-1, 3)
+            count = cursor.count()
+            vertices = cursor.array(3 * count, cursor.kind()).astype(np.float64).reshape(-1, 3)
         elif word in (b"POLYGONS", b"TRIANGLE_STRIPS", b"LINES", b"VERTICES"):
             counts, corners = _legacy_cells(cursor, path)
             if word == b"POLYGONS":
@@ -269,10 +250,10 @@ def _read_legacy(data: bytes, path: Path) -> tuple[Mesh, list[Cells]]:
         elif word == b"FIELD":
             begin = cursor.position
             cursor.word()
-            count = _count(cursor, path)
+            count = cursor.count()
             allowance.part(max(count, 0))
             for _ in range(count):
-                _skip_field(cursor, path)
+                _skip_field(cursor)
             header.append(body[begin : cursor.position])
         elif word == b"METADATA":
             cursor.skip_metadata()
@@ -289,13 +270,13 @@ def _read_legacy(data: bytes, path: Path) -> tuple[Mesh, list[Cells]]:
 def _legacy_colours(cursor: _Cursor, vertices: int) -> ByteArray | None:
     """Return the first colours among what is known of the points; what comes after the surface is not judged."""
     try:
-        if _count(cursor, cursor.path) != vertices:
+        if cursor.count() != vertices:
             return None
         for _ in range(_MOST_ATTRIBUTES):
             word = cursor.word()
             if word == b"SCALARS":
                 cursor.word()
-                kind, width = cursor.word().decode("ascii", "replace").lower(), _width(cursor.word())
+                kind, width = cursor.lower_word(), _width(cursor.word())
                 if cursor.word() != b"LOOKUP_TABLE":
                     return None
                 cursor.word()
@@ -305,20 +286,19 @@ def _legacy_colours(cursor: _Cursor, vertices: int) -> ByteArray | None:
             elif word == b"COLOR_SCALARS":
                 cursor.word()
                 width = _width(cursor.word())
-                in_text = isinstance(cursor, _TextCursor)
-                values = cursor.array(vertices * width, "f4" if in_text else "u1")
+                values = cursor.array(vertices * width, "f4" if cursor.is_text else "u1")
                 if width in _COLOUR_WIDTHS:
-                    return _three_bytes(np.rint(255.0 * values) if in_text else values, width)
+                    return _three_bytes(np.rint(255.0 * values) if cursor.is_text else values, width)
             elif word in (b"NORMALS", b"VECTORS"):
                 cursor.word()
-                cursor.array(3 * vertices, _next_kind(cursor, cursor.path))
+                cursor.array(3 * vertices, cursor.kind())
             elif word == b"FIELD":
                 cursor.word()
-                for _ in range(min(_count(cursor, cursor.path), _MOST_ATTRIBUTES)):
+                for _ in range(min(cursor.count(), _MOST_ATTRIBUTES)):
                     while cursor.word() == b"METADATA":
                         cursor.skip_metadata()
-                    width, rows = _count(cursor, cursor.path), _count(cursor, cursor.path)
-                    kind = cursor.word().decode("ascii", "replace").lower()
+                    width, rows = cursor.count(), cursor.count()
+                    kind = cursor.lower_word()
                     values = cursor.array(width * rows, _kind(kind, cursor.path))
                     if kind == "unsigned_char" and width in _COLOUR_WIDTHS and rows == vertices:
                         return _three_bytes(values, width)
@@ -340,11 +320,11 @@ def _three_bytes(values: Values, width: int) -> ByteArray | None:
     return rows.astype(np.uint8) if ((rows >= 0) & (rows <= 255)).all() else None
 
 
-def _skip_field(cursor: _Cursor, path: Path) -> None:
+def _skip_field(cursor: _Cursor) -> None:
     while cursor.word() == b"METADATA":
         cursor.skip_metadata()
-    count = _count(cursor, path) * _count(cursor, path)
-    name = cursor.word().decode("ascii", "replace").lower()
+    count = cursor.count() * cursor.count()
+    name = cursor.lower_word()
     if name in _TEXTS:
         cursor.skip_texts(count)
     elif name in _LINES:
@@ -352,15 +332,7 @@ def _skip_field(cursor: _Cursor, path: Path) -> None:
     elif name in _BITS:
         cursor.skip_bits(count)
     else:
-        cursor.array(count, _kind(name, path))
-
-
-def _count(cursor: _Cursor, path: Path) -> int:
-    return int(ints([cursor.word()], path)[0])
-
-
-def _next_kind(cursor: _Cursor, path: Path) -> str:
-    return _kind(cursor.word().decode("ascii", "replace").lower(), path)
+        cursor.array(count, _kind(name, cursor.path))
 
 
 def _kind(name: str, path: Path) -> str:
@@ -370,12 +342,12 @@ def _kind(name: str, path: Path) -> str:
 
 
 def _legacy_cells(cursor: _Cursor, path: Path) -> Cells:
-    first, second = _count(cursor, path), _count(cursor, path)
+    first, second = cursor.count(), cursor.count()
     if cursor.skip_if_offsets():
-        offsets = cursor.array(first, _next_kind(cursor, path)).astype(np.int64)
+        offsets = cursor.array(first, cursor.kind()).astype(np.int64)
         if cursor.word() != b"CONNECTIVITY":
             raise damage_error(path, f"its cells have OFFSETS without CONNECTIVITY; {CUT_SHORT}")
-        corners = cursor.array(second, _next_kind(cursor, path)).astype(np.int64)
+        corners = cursor.array(second, cursor.kind()).astype(np.int64)
         return _from_offsets(offsets, corners, path)
     packed = cursor.array(second, "i4").astype(np.int64)
     if first > 0 and second and second % first == 0:
@@ -483,7 +455,9 @@ def _read_xml(data: bytes, path: Path) -> tuple[Mesh, list[Cells]]:
                 lines.append((counts, corners + n_vertices))
                 continue
             # Checked piece by piece: joined, an index past one piece would point into the next.
-            faces.append(_faces_of(mesh_of(vertices, cut(counts, corners), path)) + n_vertices)
+            triangles = cut(counts, corners)
+            mesh_of(vertices, triangles, path)
+            faces.append(triangles + n_vertices)
         points.append(vertices)
         colours.append(_piece_colours(piece, len(vertices), xml))
         n_vertices += len(vertices)
@@ -496,10 +470,6 @@ def _read_xml(data: bytes, path: Path) -> tuple[Mesh, list[Cells]]:
         (LINE_NOTE,) if lines else (),
         header=b"".join(b" SPACE=" + codes.tobytes() for codes in spaces),
     ), lines  # fmt: skip
-
-
-def _faces_of(mesh: Mesh) -> IndexArray:
-    return np.zeros((0, 3), dtype=np.int64) if mesh.faces is None else mesh.faces.astype(np.int64)
 
 
 def _piece_points(piece: ET.Element, xml: _Xml) -> FloatArray:

@@ -9,9 +9,9 @@ from __future__ import annotations
 import io
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from datetime import datetime, timedelta
-from typing import Final, Protocol
+from typing import Final
 
 from shapespace.io.containers.archives import zip_members
 
@@ -76,24 +76,16 @@ def sheet_rows(content: bytes, sheet: str | None = None) -> list[Row]:
     return cells.rows
 
 
-class _Target(Protocol):
-    def start(self, tag: str, attrs: dict[str, str], /) -> object: ...
-
-    def end(self, tag: str, /) -> object: ...
-
-    def data(self, data: str, /) -> object: ...
-
-
 class _Handler:
     """A target of the XML parser that builds no tree, and refuses document types and entities."""
 
-    def start(self, tag: str, attrs: dict[str, str], /) -> None: ...
+    def __init__(self) -> None:
+        self.parts: list[str] = []
+        self.in_text = False
 
-    def end(self, tag: str, /) -> None: ...
-
-    def data(self, data: str, /) -> None: ...
-
-    def close(self) -> None: ...
+    def data(self, data: str, /) -> None:
+        if self.in_text:
+            self.parts.append(data)
 
     def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
         raise ValueError("declares a document type, which no workbook does")
@@ -103,6 +95,7 @@ class _Elements(_Handler):
     """Attributes of all elements with given names, in order."""
 
     def __init__(self, names: tuple[str, ...]) -> None:
+        super().__init__()
         self.names = names
         self.found: list[tuple[str, dict[str, str]]] = []
 
@@ -117,42 +110,37 @@ class _Strings(_Handler):
     """The shared strings."""
 
     def __init__(self) -> None:
+        super().__init__()
         self.strings: list[str] = []
-        self._parts: list[str] = []
-        self._in_text = self._phonetic = False
+        self._phonetic = False
 
     def start(self, tag: str, attrs: dict[str, str], /) -> None:
         name = _local(tag)
-        self._in_text = name == "t" and not self._phonetic
+        self.in_text = name == "t" and not self._phonetic
         self._phonetic = self._phonetic or name == "rPh"
 
     def end(self, tag: str, /) -> None:
         name = _local(tag)
-        self._in_text = False
+        self.in_text = False
         if name == "rPh":
             self._phonetic = False
         elif name == "si":
-            self.strings.append("".join(self._parts))
-            self._parts = []
+            self.strings.append("".join(self.parts))
+            self.parts = []
             if len(self.strings) > _MOST_CELLS:
                 raise ValueError("has too many shared strings")
-
-    def data(self, data: str, /) -> None:
-        if self._in_text:
-            self._parts.append(data)
 
 
 class _Cells(_Handler):
     """The cells of a sheet."""
 
     def __init__(self, strings: list[str], dates: frozenset[str], *, since_1904: bool) -> None:
+        super().__init__()
         self.rows: list[Row] = []
         self._strings, self._dates = strings, dates
         self._first_day = datetime(1904, 1, 1) if since_1904 else datetime(1899, 12, 30)
         self._row: dict[int, str] = {}
         self._column, self._kind, self._style = -1, "", ""
-        self._parts: list[str] = []
-        self._in_value = False
         self._cells = self._characters = 0
 
     def start(self, tag: str, attrs: dict[str, str], /) -> None:
@@ -165,14 +153,14 @@ class _Cells(_Handler):
             self._column = _column(reference[1]) if reference else self._column + 1
             if self._column >= _MOST_COLUMNS:
                 raise ValueError("has more columns than a sheet can have")
-            self._kind, self._style, self._parts = attrs.get("t", "n"), attrs.get("s", "0"), []
-        self._in_value = name in ("v", "t")
+            self._kind, self._style, self.parts = attrs.get("t", "n"), attrs.get("s", "0"), []
+        self.in_text = name in ("v", "t")
 
     def end(self, tag: str, /) -> None:
         name = _local(tag)
-        self._in_value = False
+        self.in_text = False
         if name == "c":
-            text = self._text("".join(self._parts))
+            text = self._text("".join(self.parts))
             self._cells += 1
             self._characters += len(text)
             if self._cells > _MOST_CELLS or self._characters > _MOST_TEXT:
@@ -182,10 +170,6 @@ class _Cells(_Handler):
         elif name == "row" and self._row:
             self.rows.append(self._row)
             self._row = {}
-
-    def data(self, data: str, /) -> None:
-        if self._in_value:
-            self._parts.append(data)
 
     def _text(self, value: str) -> str:
         if self._kind == "s":
@@ -218,12 +202,10 @@ class _Cells(_Handler):
         return moment.isoformat(sep=" ") if seconds % 86_400 else moment.date().isoformat()
 
 
-def _parse(members: Mapping[str, bytes], name: str, target: _Target) -> None:
-    feed: Callable[[bytes], object] | None = None
+def _parse(members: Mapping[str, bytes], name: str, target: _Handler) -> None:
+    parser = ET.XMLParser(target=target)
     try:
-        parser = ET.XMLParser(target=target)
-        feed = parser.feed
-        feed(members.get(name, b""))
+        parser.feed(members.get(name, b""))
         parser.close()
     except (ET.ParseError, LookupError) as error:
         raise ValueError(f"is no workbook, or it is damaged ({name[:60]})") from error

@@ -13,7 +13,7 @@ from typing import Any, Literal, Self
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.io.containers.arrays import write_arrays
+from shapespace.io.containers.archives import write_arrays
 from shapespace.io.files import make_folder, write_text
 from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.io.tables.table_io import write_rows

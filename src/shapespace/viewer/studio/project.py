@@ -21,8 +21,7 @@ from shapespace.cohort.table import match_rows, names_of_file, notes_on_classes,
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.containers.json_files import read_json
 from shapespace.io.files import atomic_path, make_folder, write_error, write_text
-from shapespace.io.meshes.mesh_folders import mesh_files
-from shapespace.io.meshes.mesh_io import MESH_FILE_ENDINGS, stem_of
+from shapespace.io.meshes.mesh_io import MESH_FILE_ENDINGS, mesh_files, stem_of
 from shapespace.io.tables.table_io import key_column, table_text
 from shapespace.schemas import json_text, read
 from shapespace.types import MM_PER_UNIT

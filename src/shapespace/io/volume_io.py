@@ -158,7 +158,8 @@ def read_volume(path: Path | str, *, max_memory_bytes: int = MAX_MEMORY_BYTES) -
         raise damage_error(path, "its header and its data are two files; save it as one, .nii.gz or .nrrd")
     if not name.endswith(VOLUME_ENDINGS):
         raise damage_error(path, f"it is not a volume by its ending; use one of {', '.join(VOLUME_ENDINGS)}")
-    with open_file(path) as file, ExitStack() as stack:
+    # A damaged header may have numbers that are not finite, which are refused below.
+    with open_file(path) as file, ExitStack() as stack, np.errstate(invalid="ignore", over="ignore"):
         try:
             size = os.fstat(file.fileno()).st_size
             _check_size(size, path)
@@ -424,8 +425,10 @@ def _open_meta(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tuple
         raise damage_error(path, "its voxels have several values or are text; save one label per voxel, as binary data")
     name, start = end[1].decode("utf-8", "replace"), end.end()
     if name.upper() != "LOCAL":
-        if not name or name.upper().startswith("LIST") or re.search(r"[/\\%]", name):
+        if not name or name.upper().startswith("LIST") or re.search(r"[/\\%\x00-\x1f]", name):
             raise damage_error(path, f"its data are not in one file in its folder ({name[:60]!r}); save it as .mha")
+        if not (path.parent / name).is_file():
+            raise damage_error(path, f"its data file {name[:60]!r} is not in its folder; copy it there or save as .mha")
         file = stack.enter_context(open_file(path.parent / name))
         size = os.fstat(file.fileno()).st_size
         start = size - head.bytes if skip < 0 else skip
