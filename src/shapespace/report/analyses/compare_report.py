@@ -16,8 +16,11 @@ from shapespace.report.analyses.analysis_report import (
     Column,
     LengthFormat,
     Table,
+    blank_sentence,
+    cohort_report,
     floats,
     histogram_part,
+    shape_change_parts,
 )
 from shapespace.report.analyses.methods_section import (
     bias_of_p,
@@ -27,7 +30,6 @@ from shapespace.report.analyses.methods_section import (
     multiplicity_sentence,
 )
 from shapespace.report.analyses.morphospace_report import compared_morphospace
-from shapespace.report.analyses.shape_data import blank_sentence, cohort_report, shape_change_parts
 from shapespace.schemas import CurvePart, Part, Series, SurfaceMapPart, TextPart
 from shapespace.statistics.compare_maps import EffectMap, Tested
 from shapespace.statistics.compare_shapes import MOST_LEVELS, CompareResult, ShapeEffect, TermTest

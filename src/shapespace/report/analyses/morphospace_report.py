@@ -10,8 +10,15 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import InputError
-from shapespace.report.analyses.analysis_report import AnalysisReport, Column, LengthFormat, Table
-from shapespace.report.analyses.shape_data import cohort_report, scree_part, tangent_parts
+from shapespace.report.analyses.analysis_report import (
+    AnalysisReport,
+    Column,
+    LengthFormat,
+    Table,
+    cohort_report,
+    scree_part,
+    tangent_parts,
+)
 from shapespace.schemas import ConfusionPart, MorphospacePart
 from shapespace.statistics.compare_shapes import CompareResult
 from shapespace.statistics.methods import methods_of, sample_sizes

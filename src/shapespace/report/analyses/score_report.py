@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.report.analyses.analysis_report import AnalysisReport, Column, LengthFormat, Table, histogram_part
-from shapespace.report.analyses.shape_data import cohort_report, shape_change_parts
+from shapespace.report.analyses.analysis_report import (
+    AnalysisReport,
+    Column,
+    LengthFormat,
+    Table,
+    cohort_report,
+    histogram_part,
+    shape_change_parts,
+)
 from shapespace.report.blocks.wording import counted
 from shapespace.schemas import HistogramPart, Part, SurfaceMapPart, TextPart
 from shapespace.statistics.score_subjects import SMALL, ScoreResult
@@ -145,14 +153,14 @@ def _histogram(result: ScoreResult) -> HistogramPart:
     )  # fmt: skip
 
 
-def _maps(result: ScoreResult, order: list[int]) -> list[Part]:
+def _maps(result: ScoreResult, order: list[int]) -> Iterator[Part]:
     rest = len(order) - _MOST_MAPS
     text = (
         "How far each vertex lies from the reference's mean along its normal, in standard deviations of the reference"
         f"{'' if result.subjects.fitted is None else ' and what the fit is unsure of'}."
         f"{f' Maps of {rest} more are in {_FILE}.' if rest > 0 else ''}"
     )
-    parts: list[Part] = [TextPart(title="Maps", level=2, text=text)]
+    yield TextPart(title="Maps", level=2, text=text)
     for k in order[:_MOST_MAPS]:
         beyond = ""
         if math.isfinite(result.z_limit):
@@ -160,13 +168,10 @@ def _maps(result: ScoreResult, order: list[int]) -> list[Part]:
                 f"{int((np.abs(result.z[k]) > result.z_limit).sum()):,} of {int(np.isfinite(result.z[k]).sum()):,} "
                 f"vertices lie beyond {result.z_limit:.1f} standard deviations."
             )
-        parts.append(
-            SurfaceMapPart(
-                title=result.names[k], arrays=_FILE, values=f"z_{k + 1}", unit="standard deviations, outwards (+)",
-                limit=_LIMIT_SD, note=beyond,
-            )
+        yield SurfaceMapPart(
+            title=result.names[k], arrays=_FILE, values=f"z_{k + 1}", unit="standard deviations, outwards (+)",
+            limit=_LIMIT_SD, note=beyond,
         )  # fmt: skip
-    return parts
 
 
 def _morphs(result: ScoreResult, order: list[int]) -> list[Part]:

@@ -48,8 +48,7 @@ from shapespace.report.blocks.wording import (
     training_text,
     words,
 )
-from shapespace.report.inputs.saved_fits import Direction, Measure, SavedFit
-from shapespace.report.inputs.staged_fit import REGIONS, StagedFit, measured_mm
+from shapespace.report.inputs.saved_fits import REGIONS, Direction, Measure, SavedFit, StagedFit, measured_mm
 from shapespace.report.pages.page import Page
 from shapespace.report.render import thumbnails
 from shapespace.report.render.scene import pack_fit, pack_model, pack_scatter, pack_surfaces

@@ -38,7 +38,7 @@ from shapespace.report.blocks.wording import counted as counted
 from shapespace.report.blocks.wording import mm as mm
 from shapespace.report.blocks.wording import percent as percent
 from shapespace.report.blocks.wording import printable
-from shapespace.report.inputs.staged_fit import StagedFit, measured_mm
+from shapespace.report.inputs.saved_fits import StagedFit, measured_mm
 from shapespace.report.render.palette import DIVERGING, SCAN_COLOUR, SEQUENTIAL, Colour
 from shapespace.report.render.renderer import Camera, Image, Layer, point_spacing
 from shapespace.report.render.thumbnails import Still, encoded

@@ -45,7 +45,7 @@ from shapespace.report.figures.draw import (
     unknown,
     view,
 )
-from shapespace.report.inputs.staged_fit import StagedFit, measured_mm, nice_ceiling, scale_end
+from shapespace.report.inputs.saved_fits import StagedFit, measured_mm, nice_ceiling, scale_end
 from shapespace.report.render.palette import (
     BEYOND_COLOUR,
     CLAY,
@@ -59,7 +59,7 @@ from shapespace.report.render.palette import (
     Colour,
     as_hex,
 )
-from shapespace.report.render.renderer import Camera, Image, Layer, distance_layer, render, render_series
+from shapespace.report.render.renderer import Camera, Layer, distance_layer, render, render_series
 from shapespace.types import FloatArray, Mesh
 
 THRESHOLDS_MM = (2.0, 4.0, 6.0, 8.0, 10.0)
@@ -577,11 +577,7 @@ def aligned_grid(
 ) -> Figure:
     """Draw scan and fitted model superimposed for many fits, in the order given."""
     return grid(
-        _caption_rows(
-            _equal_views(fits, columns, lambda fit: [scan_over(fit.scan), Layer(fit.surfaces["final"], MODEL_COLOUR)]),
-            fits,
-            columns,
-        ),
+        _equal_views(fits, columns, lambda fit: [scan_over(fit.scan), Layer(fit.surfaces["final"], MODEL_COLOUR)]),
         title=title,
         keys=[("scan", SCAN_COLOUR), ("model", MODEL_COLOUR)],
         note=mean_words(fits),
@@ -597,21 +593,10 @@ def distance_maps(
     known = np.concatenate([measured_mm(f.model_to_scan_mm["final"]) for f in fits])
     top = nice_ceiling(float(np.percentile(known, 99)) if len(known) else 1.0)
     return grid(
-        _caption_rows(
-            _equal_views(
-                fits,
-                columns,
-                lambda fit: [
-                    Layer(
-                        fit.surfaces["final"],
-                        scalars=np.abs(fit.model_to_scan_mm["final"]),
-                        colormap=SEQUENTIAL,
-                        vmax=top,
-                    )
-                ],
-            ),
+        _equal_views(
             fits,
             columns,
+            lambda fit: [distance_layer(fit.surfaces["final"], fit.model_to_scan_mm["final"], top, signed=False)],
         ),
         title=title,
         scale=_unsigned(fits, top),
@@ -631,14 +616,14 @@ def _grey(fits: Sequence[StagedFit]) -> list[tuple[str, Colour]]:
     return [(NOT_SHOWN, UNKNOWN_COLOUR)] if any(unknown(fit.model_to_scan_mm["final"]) for fit in fits) else []
 
 
-def _equal_views(fits: Sequence[StagedFit], columns: int, layers: Callable[[StagedFit], list[Layer]]) -> list[Image]:
-    """Return one view per fit, each from its own front, all of one size."""
+def _equal_views(fits: Sequence[StagedFit], columns: int, layers: Callable[[StagedFit], list[Layer]]) -> list[Row]:
+    """Return rows with one view per fit, each from its own front, all of one size, under its mean distance."""
     if not fits:
         raise InputError("There is nothing to draw without fits.")
     columns = min(columns, max(len(fits), 3))
     views = [view(fit.surfaces["final"].vertices, columns, margin=0.07) for fit in fits]
     size = (views[0].size[0], int(np.median([item.size[1] for item in views])))
-    return [
+    images = [
         render(
             *layers(fit),
             camera=Camera.framing(fit.surfaces["final"].vertices, aspect=size[0] / size[1], margin=0.07),
@@ -646,8 +631,4 @@ def _equal_views(fits: Sequence[StagedFit], columns: int, layers: Callable[[Stag
         )
         for fit in fits
     ]
-
-
-def _caption_rows(images: Sequence[Image], fits: Sequence[StagedFit], columns: int) -> list[Row]:
-    columns = min(columns, max(len(fits), 3))
     return in_rows(images, [f"{short(f.label, 30)}\n{mm(mean_mm(f))}" for f in fits], columns)

@@ -18,7 +18,7 @@ from shapespace.cohort.orientation import current_orientation, view_rotation
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.geometry.landmark_alignment import AlignedLandmarks
 from shapespace.geometry.thin_plate_spline import ThinPlateSpline
-from shapespace.report.analyses.shape_data import MOST_LANDMARKS
+from shapespace.report.analyses.analysis_report import MOST_LANDMARKS
 from shapespace.report.figures.analysis_figures import upright_views
 from shapespace.report.figures.draw import (
     BACKWARD,
@@ -42,7 +42,7 @@ from shapespace.report.figures.draw import (
     type_size,
     view,
 )
-from shapespace.report.inputs.staged_fit import nice_ceiling
+from shapespace.report.inputs.saved_fits import nice_ceiling
 from shapespace.report.render.palette import CATEGORIES, DIVERGING, SEQUENTIAL, UNKNOWN_COLOUR
 from shapespace.report.render.renderer import Layer, render
 from shapespace.schemas import MorphospacePart

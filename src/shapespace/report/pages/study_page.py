@@ -19,7 +19,7 @@ from shapespace.cohort.orientation import find_orientation
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.io.files import make_folder, write_text
 from shapespace.report import figures
-from shapespace.report.analyses.shape_data import MOST_LANDMARKS
+from shapespace.report.analyses.analysis_report import MOST_LANDMARKS
 from shapespace.report.blocks import sections
 from shapespace.report.blocks.blocks import (
     Block,

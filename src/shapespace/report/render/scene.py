@@ -23,7 +23,7 @@ import numpy.typing as npt
 from shapespace.cohort.orientation import current_orientation
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.remesh import collapse
-from shapespace.report.inputs.staged_fit import StagedFit, measured_mm
+from shapespace.report.inputs.saved_fits import StagedFit, measured_mm
 from shapespace.report.render import palette as colours
 from shapespace.schemas import FitRecord, to_json
 from shapespace.types import FloatArray, IntArray, Mesh
