@@ -80,7 +80,7 @@ def test_each_fact_follows_the_record(change: dict[str, Any], words: str) -> Non
 
 
 def test_the_report_and_the_file_describe_the_data_by_the_same_sentence() -> None:
-    part = methods_parts(METHODS)[0]
+    part = next(methods_parts(METHODS))
     assert isinstance(part, TextPart) and part.text[0] in text_of()
 
 

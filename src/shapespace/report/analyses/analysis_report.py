@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal, Self, cast
+from typing import Any, Self, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -56,8 +56,7 @@ REDUCED_MORPH_NOTE = "Drawn smaller than it is, so that no triangle flips."
 """The note of a morph whose full size would flip triangles."""
 
 
-@dataclass(frozen=True)
-class Column:
+class Column(TableColumn, frozen=True):
     """A column of a table: on the page, in the CSV file, or in both.
 
     Args:
@@ -66,13 +65,11 @@ class Column:
         field: name in the file; empty for a column of the page alone.
     """
 
-    name: str = ""
-    kind: Literal["text", "percent", "interval", "number", "mm", "p", "count"] = "text"
     field: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Table:
+class ResultTable:
     """A table, from which its part of the page and its CSV file follow; numbers that are not finite are unknown.
 
     Args:
@@ -94,9 +91,9 @@ class Table:
     shown: Iterable[int] | None = None
 
     @staticmethod
-    def of_fields(file: str, fields: Sequence[str], rows: Sequence[Sequence[Any]]) -> Table:
+    def of_fields(file: str, fields: Sequence[str], rows: Sequence[Sequence[Any]]) -> ResultTable:
         """Return a table that is a file alone, with the columns `fields`."""
-        return Table(columns=[Column(field=one) for one in fields], rows=rows, file=file)
+        return ResultTable(columns=[Column(field=one) for one in fields], rows=rows, file=file)
 
     @property
     def part(self) -> TablePart:
@@ -235,7 +232,7 @@ class AnalysisReport:
     __repr__ = short_repr
 
     @classmethod
-    def of(cls, question: str, title: str, content: Iterable[Part | Table], **known: Any) -> Self:
+    def of(cls, question: str, title: str, content: Iterable[Part | ResultTable], **known: Any) -> Self:
         """Return a report whose parts and CSV files are those of its content.
 
         Args:
@@ -246,9 +243,9 @@ class AnalysisReport:
         """
         every = tuple(content)
         parts = tuple(
-            one.part if isinstance(one, Table) else one for one in every if one.title or isinstance(one, Part)
+            one.part if isinstance(one, ResultTable) else one for one in every if one.title or isinstance(one, Part)
         )
-        tables = {one.file: one.file_rows for one in every if isinstance(one, Table) and one.file}
+        tables = {one.file: one.file_rows for one in every if isinstance(one, ResultTable) and one.file}
         return cls(question=question, title=title, parts=parts, tables=tables, **known)
 
     def analysis(self) -> Analysis:
@@ -291,7 +288,7 @@ class AnalysisReport:
         return path
 
 
-_FILE = "observed.csv"
+_ESTIMATES_FILE = "observed.csv"
 _MOST_ROWS = 10  # rows that fit one screen; files have all
 _VERTEX_WORDS = re.compile(r"(?<![A-Za-z])[Vv]ert(?:ices|ex)(?![A-Za-z])")  # in sentences and names of columns
 _LANDMARK_WORDS = {"vertices": "landmarks", "vertex": "landmark", "Vertices": "Landmarks", "Vertex": "Landmark"}
@@ -497,7 +494,7 @@ def _in_landmarks(report: AnalysisReport) -> AnalysisReport:
 def cohort_report(
     question: str,
     title: str,
-    content: Iterable[Part | Table],
+    content: Iterable[Part | ResultTable],
     cohort: Cohort,
     *,
     methods: Methods,
@@ -545,7 +542,7 @@ def cohort_report(
     return _in_landmarks(report) if cohort.source.kind == "landmarks" else report
 
 
-def _estimate_tables(cohort: Cohort) -> tuple[Table, ...]:
+def _estimate_tables(cohort: Cohort) -> tuple[ResultTable, ...]:
     """Return the share of estimated vertices of each shape; nothing if all are observed."""
     share, title = cohort.estimated_share, "Estimated vertices"
     note = (
@@ -555,12 +552,12 @@ def _estimate_tables(cohort: Cohort) -> tuple[Table, ...]:
     if cohort.source.kind == "landmarks":
         title, note = "Estimated landmarks", "Share of the landmarks of a specimen that are estimates, largest first."
     order = sorted(range(len(share)), key=lambda k: (-share[k], k))
-    table = Table(
+    table = ResultTable(
         title=title,
         columns=(Column("shape", field="shape"), Column("estimated", "percent", "estimated_share")),
         rows=[(cohort.names[k], float(share[k])) for k in order if share[k] > 0],
         shown=range(_MOST_ROWS),
-        note=f"{note} All of them are in {_FILE}.",
-        file=_FILE,
+        note=f"{note} All of them are in {_ESTIMATES_FILE}.",
+        file=_ESTIMATES_FILE,
     )
     return (table,) if share.any() else ()

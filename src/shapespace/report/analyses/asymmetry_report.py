@@ -17,7 +17,7 @@ from shapespace.report.analyses.analysis_report import (
     AnalysisReport,
     Column,
     LengthFormat,
-    Table,
+    ResultTable,
     blank_sentence,
     cohort_report,
     histogram_part,
@@ -185,9 +185,9 @@ def _number_text(value: float | None) -> str:
     return "not known" if value is None else f"{value:.3g}"
 
 
-def _anova_table(result: AsymmetryResult, title: str, anova: Sequence[AnovaRow], file: str, note: str) -> Table:
+def _anova_table(result: AsymmetryResult, title: str, anova: Sequence[AnovaRow], file: str, note: str) -> ResultTable:
     lengths = _lengths(result)
-    return Table(
+    return ResultTable(
         title=title,
         columns=(
             Column("source", field="source"),
@@ -211,10 +211,10 @@ def _histogram(result: AsymmetryResult) -> HistogramPart:
     )  # fmt: skip
 
 
-def _subject_table(result: AsymmetryResult, order: Any) -> Table:
+def _subject_table(result: AsymmetryResult, order: Any) -> ResultTable:
     s, v, lengths = result.scores, result.vertex_scores, _lengths(result)
     numbers = (s.mm, s.low, s.high, s.raw_mm, result.z, result.z_low, result.z_high)
-    return Table(
+    return ResultTable(
         title="The most asymmetric subjects" if len(order) > _MOST_ROWS else "Subjects",
         columns=(
             Column("subject", field="subject"), Column("shapes", "count", "shapes"),
@@ -245,7 +245,7 @@ def _vectors(mean: FloatArray, half_difference: FloatArray, arrays: dict[str, An
                             low_label="the mirrored mean", high_label="the mean", times=times),)  # fmt: skip
 
 
-def _maps_and_morphs(result: AsymmetryResult, order: Any) -> tuple[Mapping[str, Any], list[Part | Table]]:
+def _maps_and_morphs(result: AsymmetryResult, order: Any) -> tuple[Mapping[str, Any], list[Part | ResultTable]]:
     subjects = [int(k) for k in order[:_MOST_MAPS]]
     half_difference = result.difference.mean(axis=0) / 2.0
     arrays: dict[str, Any] = {
@@ -264,7 +264,7 @@ def _maps_and_morphs(result: AsymmetryResult, order: Any) -> tuple[Mapping[str, 
         return arrays, [_point_table(result), *_vectors(result.mean, half_difference, arrays)]
     arrays["faces"] = result.sides.faces
     untested = not result.permutations
-    parts: list[Part | Table] = [
+    parts: list[Part | ResultTable] = [
         SurfaceMapPart(
             title="Directional asymmetry", level=2, arrays=_FILE, values="directional_mm",
             mask="" if untested else "shown",
@@ -324,15 +324,20 @@ def _blank_note(result: AsymmetryResult) -> str:
     return "" if result.blank is None else f" {blank_sentence(int(result.blank.sum()), len(result.blank))}"
 
 
-def _point_table(result: AsymmetryResult) -> Table:
+def _point_table(result: AsymmetryResult) -> ResultTable:
     names = {vertex: name for name, vertex in (result.cohort.landmarks or SurfaceLandmarks()).items()}
     lengths, vertices = _lengths(result), map(int, result.sides.vertices)
-    columns = (Column("vertex"), lengths.column("directional"), Column("p", "p"), lengths.column("fluctuating"))
+    columns = (
+        Column("vertex"),
+        lengths.column("directional"),
+        Column("p", "p"),
+        lengths.column("fluctuating"),
+    )
     rows = zip(
         [names.get(v, str(v)) for v in vertices], result.directional, result.directional_p, result.fluctuating,
         strict=True,
     )  # fmt: skip
-    return Table(title="Vertices", columns=columns, rows=list(rows), note="p is family-wise.")
+    return ResultTable(title="Vertices", columns=columns, rows=list(rows), note="p is family-wise.")
 
 
 def _meshes(result: AsymmetryResult, order: Any) -> dict[str, Mesh]:

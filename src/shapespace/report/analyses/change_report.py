@@ -15,7 +15,7 @@ from shapespace.report.analyses.analysis_report import (
     REDUCED_MORPH_NOTE,
     AnalysisReport,
     Column,
-    Table,
+    ResultTable,
     blank_sentence,
     cohort_report,
 )
@@ -72,7 +72,7 @@ def change_report(change: ChangeResult) -> AnalysisReport:
         "faces": np.asarray(change.cohort.faces),
         "stable_share": np.mean([subject.stable for subject in change.subjects], axis=0),
     }
-    parts: list[Part | Table] = []
+    parts: list[Part | ResultTable] = []
     if change.mean_change is not None:
         parts += _mean_change_parts(change, change.mean_change, arrays)
     if change.group_difference is not None:
@@ -222,7 +222,7 @@ def _per_time(change: ChangeResult) -> str:
 
 def _mean_change_parts(
     change: ChangeResult, tests: MeanChangeTests, arrays: dict[str, npt.NDArray[Any]]
-) -> Iterator[Part | Table]:
+) -> Iterator[Part | ResultTable]:
     test = tests.surface
     unit = f"mm{_per_time(change)}"
     arrays |= {
@@ -262,11 +262,11 @@ def _region_table(change: ChangeResult, test: MapTest) -> Part:
     )  # fmt: skip
 
 
-def _landmark_table(change: ChangeResult, test: MapTest, unit: str) -> Table:
+def _landmark_table(change: ChangeResult, test: MapTest, unit: str) -> ResultTable:
     maps = np.stack([change_or_rate(one, rate=change.config.rate).along_mm for one in change.subjects])
     names = ("mean", "stddev", "low", "high")
     every = zip(change.landmarks.names, change.landmarks.interpolate(maps.T), test.p, strict=True)
-    return Table(
+    return ResultTable(
         title="Landmarks",
         columns=(
             Column("landmark", field="landmark"), *(Column(one, "mm", one) for one in names), Column("p", "p", "p"),
@@ -350,7 +350,7 @@ def _noise_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) -> l
     ]  # fmt: skip
 
 
-def _subject_table(change: ChangeResult) -> Table:
+def _subject_table(change: ChangeResult) -> ResultTable:
     every = len(change.subjects)
     more = f" The first {MOST_ROWS} of {every}; all are in subjects.csv." if every > MOST_ROWS else ""
     unit = _VolumeUnit.of(*(one.change.volumes_mm3[0] for one in change.subjects[:MOST_ROWS]))
@@ -386,13 +386,13 @@ def _subject_table(change: ChangeResult) -> Table:
                 change.time_unit,
             ]
         rows.append(row)
-    return Table(
+    return ResultTable(
         title="Subjects", level=2, columns=columns, rows=rows, file="subjects.csv", shown=range(MOST_ROWS),
         note=f"Last visit less first. {_SOURCES[change.uncertainty]}{more}",
     )  # fmt: skip
 
 
-def _subject_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) -> Iterator[Part | Table]:
+def _subject_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) -> Iterator[Part | ResultTable]:
     yield _subject_table(change)
     most = sorted(change.subjects, key=lambda one: -one.beyond_share)[:MOST_MAPS]
     for number, subject in enumerate(most, 1):
@@ -460,9 +460,9 @@ def _time_series(change: ChangeResult) -> list[Part]:
     ]
 
 
-def _file_tables(change: ChangeResult) -> Iterator[Table]:
+def _file_tables(change: ChangeResult) -> Iterator[ResultTable]:
     """Yield the tables that are files alone."""
-    yield Table.of_fields(
+    yield ResultTable.of_fields(
         "visits.csv",
         ("subject", "visit", "time", "scans", "rms_since_first_mm", "volume_since_first_mm3"),
         [
@@ -472,7 +472,7 @@ def _file_tables(change: ChangeResult) -> Iterator[Table]:
         ],
     )
     if len(change.regions) > 1:
-        yield Table.of_fields(
+        yield ResultTable.of_fields(
             "regions.csv",
             ("subject", "region", "volume_change_mm3", "stddev_mm3"),
             [
@@ -482,7 +482,7 @@ def _file_tables(change: ChangeResult) -> Iterator[Table]:
             ],
         )
     if change.landmarks:
-        yield Table.of_fields(
+        yield ResultTable.of_fields(
             "landmarks.csv",
             ("subject", "landmark", "x_mm", "y_mm", "z_mm", "moved_mm", "stddev_mm", "along_normal_mm",
              "along_normal_stddev_mm", "smallest_detectable_mm"),

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from shapespace.cohort.proportions import zero_bound
-from shapespace.report.analyses.analysis_report import AnalysisReport, Table, cohort_report, histogram_part
+from shapespace.report.analyses.analysis_report import AnalysisReport, ResultTable, cohort_report, histogram_part
 from shapespace.schemas import CurvePart, HistogramPart, Part, Series, TablePart, TextPart
 from shapespace.statistics.identity.identify import IdentificationRates, IdentificationResult
 from shapespace.statistics.identity.rates import RateEstimate
@@ -152,8 +152,8 @@ def _identity_report(
         f"Who is it? {title}",
         [
             *parts,
-            Table.of_fields("figures.csv", ("score", "figure", "value", "low", "high"), figures),
-            Table.of_fields("scans.csv", ("scan", "subject", "role"), scans),
+            ResultTable.of_fields("figures.csv", ("score", "figure", "value", "low", "high"), figures),
+            ResultTable.of_fields("scans.csv", ("scan", "subject", "role"), scans),
         ],
         trial.cohort,
         summary=tuple(filter(None, (*summary, measured))),

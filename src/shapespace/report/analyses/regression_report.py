@@ -13,7 +13,7 @@ from shapespace.report.analyses.analysis_report import (
     AnalysisReport,
     Column,
     LengthFormat,
-    Table,
+    ResultTable,
     cohort_report,
     floats,
     shape_change_parts,
@@ -187,24 +187,24 @@ def _calibration_part(result: RegressionResult) -> CurvePart:
     )  # fmt: skip
 
 
-def _file_tables(result: RegressionResult) -> tuple[Table, Table]:
+def _file_tables(result: RegressionResult) -> tuple[ResultTable, ResultTable]:
     """Return the tables of predictions and of measures, which are files alone."""
     columns = (result.observed, result.predicted, result.low, result.high, result.baseline)
     fields = ("scan", "subject", "observed", "predicted", "low", "high", "baseline")
     every = zip(result.cohort.names, result.subjects, *columns, strict=True)
     measures = [(name, m.value, m.low, m.high) for name, m in result.measures.items()]
     return (
-        Table.of_fields("predictions.csv", fields, list(every)),
-        Table.of_fields("measures.csv", ("measure", "value", "low", "high"), measures),
+        ResultTable.of_fields("predictions.csv", fields, list(every)),
+        ResultTable.of_fields("measures.csv", ("measure", "value", "low", "high"), measures),
     )
 
 
-def _new_tables(predictor: Predictor, new: tuple[Cohort, Predictions] | None) -> tuple[Part | Table, ...]:
+def _new_tables(predictor: Predictor, new: tuple[Cohort, Predictions] | None) -> tuple[Part | ResultTable, ...]:
     """Return the predictions of new shapes."""
     if new is None:
         return ()
     predictions = new[1]
-    table = Table(
+    table = ResultTable(
         title=f"{predictor.target} of new shapes" if predictions.names else "",
         columns=(
             Column("scan", field="scan"),
@@ -342,7 +342,7 @@ def _shape_summary(result: ShapePrediction) -> Iterator[str]:
         )
 
 
-def _value_table(result: ShapePrediction) -> Table:
+def _value_table(result: ShapePrediction) -> ResultTable:
     lengths = LengthFormat(result.cohort.unit)
     names = ["distance_from_first", "standard_error", "half_width"]
     widths = [np.linalg.norm(result.half_width_mm(k)) for k in range(len(result.values))]
@@ -351,7 +351,7 @@ def _value_table(result: ShapePrediction) -> Table:
         name = re.sub(r"\W+", "_", one.name)
         names += [name, f"{name}_low", f"{name}_high"]
         columns += [one.value, one.low, one.high]
-    return Table(
+    return ResultTable(
         title=f"Mean shapes along {result.along}", level=2, file="shapes.csv",
         columns=(Column(result.along, "number", result.along),
                  *(lengths.column(name.replace("_", " "), name) for name in names), Column(field="df")),
@@ -373,7 +373,7 @@ def _measure_parts(result: ShapePrediction) -> Iterator[Part]:
         )  # fmt: skip
 
 
-def _landmark_tables(result: ShapePrediction) -> Iterator[Table]:
+def _landmark_tables(result: ShapePrediction) -> Iterator[ResultTable]:
     if result.cohort.source.kind == "landmarks" and result.cohort.landmarks is not None:
         axes = "xyz"[: result.cohort.dimensions]
         header = (result.along, "landmark", *axes, *(f"{axis}_{end}" for end in ("low", "high") for axis in axes))
@@ -382,4 +382,4 @@ def _landmark_tables(result: ShapePrediction) -> Iterator[Table]:
             shape, width = result.cohort.vertices(result.coefficients[k]), result.half_width_mm(k)
             for name, *ends in zip(result.cohort.landmarks.names, shape, shape - width, shape + width, strict=True):
                 points.append((value, name, *(float(v) for end in ends for v in end[: len(axes)])))
-        yield Table.of_fields("landmarks.csv", header, points)
+        yield ResultTable.of_fields("landmarks.csv", header, points)

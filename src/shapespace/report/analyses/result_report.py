@@ -9,7 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from shapespace.report.analyses.analysis_report import AnalysisReport, Column, Table, cohort_report, histogram_part
+from shapespace.report.analyses.analysis_report import (
+    AnalysisReport,
+    Column,
+    ResultTable,
+    cohort_report,
+    histogram_part,
+)
 from shapespace.report.analyses.asymmetry_report import asymmetry_report
 from shapespace.report.analyses.change_report import change_report
 from shapespace.report.analyses.compare_report import compare_report
@@ -38,7 +44,7 @@ def shape_test_report(result: ShapeTestResult) -> AnalysisReport:
     """Return the report of a test of shape."""
     summary = result.test.summary
     files = [
-        Table.of_fields(
+        ResultTable.of_fields(
             f"{re.sub(r'[^a-z0-9]+', '_', (one.title or 'table').lower()).strip('_')}.csv",
             [own.name for own in one.columns],
             one.rows,
@@ -100,11 +106,11 @@ def _least_p(arrangements: FloatArray) -> float:
     return min(float((np.abs(arrangements - end) <= TIE * abs(end)).mean()) for end in ends)
 
 
-def _statistics_table(result: ShapeTestResult) -> Table:
+def _statistics_table(result: ShapeTestResult) -> ResultTable:
     note = f"{result.test.statistics[:1].upper()}{result.test.statistics[1:]}."
     unknown = dict.fromkeys(one.name for one in result.statistics if one.unknown_p)
     note += f" p of {', '.join(unknown)} is not known where it is blank." if unknown else ""
-    return Table(
+    return ResultTable(
         title="Statistics",
         columns=(
             Column("statistic", field="statistic"), Column("tested", field="tested"),

@@ -13,7 +13,7 @@ from shapespace.report.analyses.analysis_report import (
     AnalysisReport,
     Column,
     LengthFormat,
-    Table,
+    ResultTable,
     cohort_report,
     histogram_part,
     shape_change_parts,
@@ -32,7 +32,7 @@ def score_report(result: ScoreResult) -> AnalysisReport:
     """Return scores with all that their report shows; subjects are numbered from 1 in the arrays."""
     # Those outside the known range are first, then those who lie farthest out.
     order = sorted(map(int, np.lexsort((-result.distance, result.farther))), key=lambda k: not result.outside[k])
-    content: list[Part | Table] = [
+    content: list[Part | ResultTable] = [
         TextPart(title="The subjects", level=2, text=_method_sentences(result)),
         _score_table(result),
         *_file_tables(result),
@@ -96,7 +96,7 @@ def _method_sentences(result: ScoreResult) -> tuple[str, ...]:
     )
 
 
-def _score_table(result: ScoreResult) -> Table:
+def _score_table(result: ScoreResult) -> ResultTable:
     lengths, sized = LengthFormat(result.subjects.unit), bool(np.isfinite(result.size_z).all())
     columns = [
         Column("Subject", field="subject"), Column("Distance (SD)", "number", "distance_sd"),
@@ -120,14 +120,14 @@ def _score_table(result: ScoreResult) -> Table:
         std = result.imputations.stddev
         columns += [Column(field="distance_imputation_sd"), Column(field="percentile_imputation_sd")]
         rows = [(*row, std["distance"][k], 100 * std["farther"][k]) for k, row in enumerate(rows)]
-    return Table(
+    return ResultTable(
         title="Scores", columns=columns, rows=rows, file="scores.csv",
         note="Percentiles: share of the reference's subjects who lie nearer to its mean. On average 4.6 % of the "
         "vertices of a usual shape lie beyond 2 SD.",
     )  # fmt: skip
 
 
-def _file_tables(result: ScoreResult) -> tuple[Table, Table]:
+def _file_tables(result: ScoreResult) -> tuple[ResultTable, ResultTable]:
     """Return the tables of the nearest subjects and of the reference, which are files alone."""
     field = LengthFormat(result.subjects.unit).field
     near = [
@@ -137,8 +137,8 @@ def _file_tables(result: ScoreResult) -> tuple[Table, Table]:
     ]
     reference = zip(result.reference_names, result.reference_distance, result.reference_rest_mm, strict=True)
     return (
-        Table.of_fields("nearest.csv", ("subject", "rank", "reference", "distance_sd", field("rms")), near),
-        Table.of_fields("reference.csv", ("reference", "distance_sd", field("rest")), list(reference)),
+        ResultTable.of_fields("nearest.csv", ("subject", "rank", "reference", "distance_sd", field("rms")), near),
+        ResultTable.of_fields("reference.csv", ("reference", "distance_sd", field("rest")), list(reference)),
     )
 
 

@@ -70,6 +70,9 @@ _MOST_LINES = 4  # layout: lines of a caption
 _STEPS, _MOST_NUMBERS = (1, 5, 10, 20, 50, 100, 200, 500), 22
 
 
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")  # in the order of those of widget-morphospace-drawing.js
+
+
 @dataclass(frozen=True)
 class Layout:
     """Size and style of figures: for a page, or for print.
@@ -550,12 +553,6 @@ def empty_chart(title: str, text: str) -> Figure:
 def scan_over(mesh: Mesh) -> Layer:
     """Return the layer of a scan that lies over a model: points are drawn so small that the model is seen between."""
     return Layer(mesh, SCAN_COLOUR, point_radius_mm=None if mesh.faces is not None else 0.3 * point_spacing(mesh))
-
-
-def mean_mm(fit: StagedFit, stage: str = "final") -> float:
-    """Return the mean distance to the scan over the overlap; NaN without overlap."""
-    values = measured_mm(fit.model_to_scan_mm[stage])
-    return float(values.mean()) if len(values) else float("nan")
 
 
 def mean_words(fits: Sequence[StagedFit]) -> str:

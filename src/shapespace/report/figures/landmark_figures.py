@@ -27,6 +27,7 @@ from shapespace.report.figures.draw import (
     GREY,
     INK,
     LAYOUT,
+    MARKERS,
     RULE,
     SMALL,
     TEXT,
@@ -253,7 +254,6 @@ def draw_links(axes: Axes, points: FloatArray, colour: str, width: float = 1.6) 
     axes.add_collection(LineCollection(list(points[links]), colors=colour, linewidths=width, zorder=2))
 
 
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")  # in the order of those of widget-morphospace-drawing.js
 _FEWEST_OF_ELLIPSE = 5  # shapes; the radius of fewer is larger than the plot
 _ELLIPSE = 0.95  # probability
 _SPARSE = 5  # every fifth point of a grid line is kept, so that the page is small

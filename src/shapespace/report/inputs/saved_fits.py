@@ -1,4 +1,7 @@
-"""Reader of saved fits and the demo for reports: JSON, arrays, meshes and models, checked, inside one folder."""
+"""Reader of saved fits and the demo for reports: JSON, arrays, meshes and models, checked, inside one folder.
+
+`StagedFit` is a fit in the frame of the pictures: scan and model in mm, iteration by iteration, with signed distances.
+"""
 
 from __future__ import annotations
 
@@ -481,6 +484,14 @@ class StagedFit:
         """Where the colour scale of the signed distances ends, in every picture of this fit."""
         return scale_end(np.concatenate([self.model_to_scan_mm["final"], self.scan_to_model_mm["final"]]))
 
+    @property
+    def region_shares(self) -> dict[str, float]:
+        """Share of the vertices in each of `REGIONS`; empty where the stages were not saved."""
+        if self.regions is None:
+            return {}
+        shares = np.bincount(self.regions, minlength=len(REGIONS)) / max(len(self.regions), 1)
+        return dict(zip(REGIONS, shares.tolist(), strict=True))
+
     @staticmethod
     def of(model: ShapeModel, result: FitResult, label: str = "") -> StagedFit:
         """Return the staged fit of `result`, which was fitted by `model`."""
@@ -615,6 +626,12 @@ def _numbers_of(record: FitResult | FitRecord) -> dict[str, FloatArray]:
 def measured_mm(distances_mm: FloatArray) -> FloatArray:
     """Return the absolute values of the finite signed distances, (n,)."""
     return np.abs(distances_mm[np.isfinite(distances_mm)])
+
+
+def mean_mm(distances_mm: FloatArray) -> float:
+    """Return the mean of the absolute values of the finite signed distances; NaN for none."""
+    known = measured_mm(distances_mm)
+    return float(known.mean()) if len(known) else math.nan
 
 
 _MEDIANS = 5.0
