@@ -680,7 +680,7 @@ class TextPart(Part, frozen=True, kw_only=True, tag="text"):
     text: str | tuple[str, ...]
 
 
-class TableColumn(Struct, frozen=True, kw_only=True):
+class TableColumn(Struct, frozen=True):
     """A column of a table; shares are 0 to 1, an interval is two of them."""
 
     name: str = ""

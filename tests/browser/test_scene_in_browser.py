@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from shapespace.fit.fit_scan import FitConfig, fit_scan
-from shapespace.report.inputs.staged_fit import StagedFit
+from shapespace.report.inputs.saved_fits import StagedFit
 from shapespace.report.render import scene
 from synthetic_shapes import blob_model, raw_scan
 

@@ -11,7 +11,7 @@ import pytest
 import shapespace as ss
 from shapespace.errors import FileError, InputError
 from shapespace.io.meshes.mesh_io import write_mesh
-from shapespace.report.analyses.result_tables import analysis_report
+from shapespace.report.analyses.result_report import analysis_report
 from synthetic_shapes import raw_scan, similarity, training_meshes
 
 Run = Callable[..., str]

@@ -13,7 +13,7 @@ from shapespace.fit.result import FitResult, carried_colours
 from shapespace.fit.stages import stage_arrays
 from shapespace.geometry.closest import build_engine
 from shapespace.io.meshes.mesh_io import read_mesh
-from shapespace.report.inputs.staged_fit import StagedFit
+from shapespace.report.inputs.saved_fits import StagedFit
 from shapespace.report.render.scene import pack_fit
 from shapespace.types import GREY, FloatArray, Mesh
 from synthetic_shapes import blob_model, raw_scan, similarity

@@ -37,8 +37,7 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.recognise.classifier_file import FACTS, SavedClassifier, load_classifier, software_versions
 from shapespace.recognise.classifiers import CLASSIFIERS
 from shapespace.recognise.labelled_scans import from_record, read_coefficients
-from shapespace.report.inputs.saved_fits import Folder, find_fits
-from shapespace.report.inputs.staged_fit import StagedFit
+from shapespace.report.inputs.saved_fits import Folder, StagedFit, find_fits
 from shapespace.schemas import (
     CORRESPOND_AGAIN,
     Analysis,

@@ -15,7 +15,7 @@ from shapespace.fit.iteration_state import UNSEEN
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report import figures
 from shapespace.report.figures import draw
-from shapespace.report.inputs.staged_fit import Moment, StagedFit
+from shapespace.report.inputs.saved_fits import Moment, StagedFit
 from shapespace.types import Mesh, Similarity
 from synthetic_shapes import blob_model, raw_scan
 

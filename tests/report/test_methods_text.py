@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from shapespace.cohort.cohort import Cohort, ShapeSource
-from shapespace.report.analyses.analysis_report import METHODS_FILE, AnalysisReport
+from shapespace.report.analyses.analysis_report import METHODS_FILE, cohort_report
 from shapespace.report.analyses.methods_section import alignment_text, citations_of, methods_parts, methods_text
-from shapespace.report.analyses.shape_data import add_shape_data
 from shapespace.schemas import AlignRecord, Analysis, Dispersion, Methods, TestScheme, TextPart
 from shapespace.statistics.compare_shapes import CompareConfig, compare
 from shapespace.statistics.methods import REDUCED_OF_EACH_TERM, methods_of
@@ -81,7 +80,7 @@ def test_each_fact_follows_the_record(change: dict[str, Any], words: str) -> Non
 
 
 def test_the_report_and_the_file_describe_the_data_by_the_same_sentence() -> None:
-    part = methods_parts(METHODS)[0]
+    part = next(methods_parts(METHODS))
     assert isinstance(part, TextPart) and part.text[0] in text_of()
 
 
@@ -141,8 +140,10 @@ def test_reports_of_landmarks_do_not_call_them_vertices(tmp_path: Path) -> None:
 
 
 def test_answers_without_tests_state_their_data(tmp_path: Path) -> None:
-    bare = AnalysisReport("recognise verify", "Title", (), (), settings={"subject": "subject", "draws": 50, "seed": 4})
-    add_shape_data(bare, cohort()).save(tmp_path)
+    cohort_report(
+        "recognise verify", "Title", (), cohort(), methods=methods_of(cohort(), 6), summary=(),
+        settings={"subject": "subject", "draws": 50, "seed": 4},
+    ).save(tmp_path)  # fmt: skip
     text = (tmp_path / METHODS_FILE).read_text("utf-8")
     assert "12 shapes of 6 subjects" in text and "bootstrap draws 50" in text and "Brümmer" in text
 

@@ -13,7 +13,7 @@ from shapespace.cohort.cohort import Cohort
 from shapespace.errors import InputError
 from shapespace.fit.diagnostics.reasons import Reason
 from shapespace.io.meshes.mesh_io import write_mesh
-from shapespace.report.analyses.result_tables import analysis_report
+from shapespace.report.analyses.result_report import analysis_report
 from shapespace.report.figures import spectrum_figure
 from shapespace.statistics.predictor import Predictions
 from symmetric_object import symmetric_object

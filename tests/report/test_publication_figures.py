@@ -19,8 +19,7 @@ from PIL import Image
 from shapespace.cohort.orientation import find_orientation, view_rotation
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.report import figures
-from shapespace.report.analyses.analysis_report import AnalysisReport
-from shapespace.report.analyses.shape_data import scree_part, tangent_part
+from shapespace.report.analyses.analysis_report import AnalysisReport, scree_part, tangent_part
 from shapespace.report.figures.analysis_figures import views_of
 from shapespace.report.figures.draw import ONE_COLUMN_MM, TWO_COLUMNS_MM, charts, finish, legend, legend_columns
 from shapespace.report.pages.write_html import FigureConfig, write_figures

@@ -15,7 +15,7 @@ import pytest
 
 from shapespace.errors import InputError
 from shapespace.fit.fit_scan import FitConfig, fit_scan
-from shapespace.report.inputs.staged_fit import StagedFit
+from shapespace.report.inputs.saved_fits import StagedFit
 from shapespace.report.render import scene
 from shapespace.report.render.scene import SCENE_SCRIPTS, WIDGET_SCRIPTS
 from shapespace.types import Mesh, SurfaceLandmarks

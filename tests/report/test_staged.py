@@ -17,12 +17,12 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.report.inputs.saved_fits import (
     Folder,
     ScanNotFoundError,
+    StagedFit,
     find_fits,
     model_of,
     saved_surfaces,
     staged_fit,
 )
-from shapespace.report.inputs.staged_fit import StagedFit
 from synthetic_shapes import blob_model, raw_scan
 
 CONFIG = FitConfig(method="paper", max_iterations=4)

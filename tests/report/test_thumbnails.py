@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from shapespace.fit.fit_scan import FitConfig, fit_scan
-from shapespace.report.inputs.staged_fit import StagedFit
+from shapespace.report.inputs.saved_fits import StagedFit
 from shapespace.report.render import thumbnails
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model, raw_scan

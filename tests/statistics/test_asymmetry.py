@@ -18,7 +18,7 @@ from shapespace.errors import FileFormatError, InputError
 from shapespace.geometry.mirror_plane import find_mirror, mirror_pairs
 from shapespace.geometry.normals import face_vectors, vertex_normals
 from shapespace.model.shape_model import ShapeModel
-from shapespace.report.analyses.result_tables import analysis_report
+from shapespace.report.analyses.result_report import analysis_report
 from shapespace.schemas import read_part
 from shapespace.statistics.asymmetry import (
     ERROR_ASYMMETRIC,

@@ -16,7 +16,7 @@ from shapespace.cohort.table import Table
 from shapespace.errors import InputError
 from shapespace.geometry.normals import enclosed_volume, face_vectors, vertex_areas, vertex_normals
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.report.analyses.result_tables import analysis_report
+from shapespace.report.analyses.result_report import analysis_report
 from shapespace.schemas import Analysis, MorphPart, SurfaceMapPart, TablePart, read, read_part
 from shapespace.statistics.change_align import align_by, align_robustly
 from shapespace.statistics.change_maps import align_visits, swept_mm3

@@ -16,7 +16,7 @@ from shapespace.errors import InputError
 from shapespace.geometry.normals import vertex_normals
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report.analyses.compare_report import compare_warnings
-from shapespace.report.analyses.result_tables import analysis_report
+from shapespace.report.analyses.result_report import analysis_report
 from shapespace.schemas import PARTS, Analysis, TablePart, TextPart, json_text
 from shapespace.statistics import compare_maps
 from shapespace.statistics.compare_formula import FUNCTIONS, design_of, random_effects_of

@@ -9,7 +9,7 @@ import pytest
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.table import Table
 from shapespace.errors import InputError
-from shapespace.report.analyses.result_tables import analysis_report
+from shapespace.report.analyses.result_report import analysis_report
 from shapespace.statistics.compare_formula import design_of
 from shapespace.statistics.compare_shapes import CompareConfig, CompareResult, compare, term_tests
 from shapespace.statistics.compare_within import strata_of

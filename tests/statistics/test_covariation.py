@@ -12,7 +12,7 @@ from shapespace.cohort.cohort import Cohort
 from shapespace.errors import FileFormatError, InputError
 from shapespace.geometry.landmark_alignment import align_landmarks
 from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations
-from shapespace.report.analyses.shape_test_report import shape_test_report
+from shapespace.report.analyses.result_report import shape_test_report
 from shapespace.statistics.shape_tests.covariation import compare_effect_sizes, estimate_modularity, fit_pls
 from shapespace.statistics.shape_tests.permutations import orders
 from shapespace.statistics.shape_tests.shape_test_result import Statistic

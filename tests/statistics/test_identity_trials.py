@@ -11,7 +11,7 @@ from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.table import Table
 from shapespace.errors import InputError
 from shapespace.model.additive import AdditiveModel
-from shapespace.report.analyses.result_tables import analysis_report
+from shapespace.report.analyses.result_report import analysis_report
 from shapespace.schemas import Analysis
 from shapespace.statistics.identity.identify import identify
 from shapespace.statistics.identity.scores import samples_of

@@ -8,7 +8,7 @@ from scipy.spatial import procrustes
 
 from shapespace.cohort.cohort import Cohort, with_columns
 from shapespace.errors import InputError
-from shapespace.report.analyses.shape_test_report import shape_test_report
+from shapespace.report.analyses.result_report import shape_test_report
 from shapespace.statistics.compare_shapes import CompareConfig, SquaresType, compare, off_common_direction
 from shapespace.statistics.effect_size import permutation_p
 from shapespace.statistics.shape_tests.linear import (

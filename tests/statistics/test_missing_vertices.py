@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from shapespace.cohort.cohort import Cohort
-from shapespace.report.analyses.result_tables import analysis_report
-from shapespace.report.analyses.shape_data import shape_notes, shape_settings
+from shapespace.report.analyses.analysis_report import shape_notes, shape_settings
+from shapespace.report.analyses.result_report import analysis_report
 from shapespace.statistics.asymmetry import measure_asymmetry
 from shapespace.statistics.compare_shapes import CompareConfig, compare
 from shapespace.statistics.measure_change import change

@@ -11,7 +11,7 @@ from scipy import stats
 from shapespace.cohort.cohort import Cohort
 from shapespace.errors import InputError
 from shapespace.report.analyses.methods_section import methods_text
-from shapespace.report.analyses.result_tables import analysis_report
+from shapespace.report.analyses.result_report import analysis_report
 from shapespace.statistics.asymmetry import measure_asymmetry
 from shapespace.statistics.change_result import ChangeConfig
 from shapespace.statistics.compare_shapes import CompareConfig, compare

@@ -13,7 +13,7 @@ from shapespace.geometry.landmark_alignment import align_landmarks
 from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations
 from shapespace.io.trees import Tree
 from shapespace.report.analyses.morphospace_report import morphospace_report
-from shapespace.report.analyses.shape_test_report import shape_test_report
+from shapespace.report.analyses.result_report import shape_test_report
 from shapespace.statistics.shape_tests.ordination import OrdinationMethod, ordinate
 from shapespace.statistics.shape_tests.permutations import orders
 from shapespace.statistics.shape_tests.phylogenetic import (

@@ -16,7 +16,7 @@ from shapespace.fit.robust.posterior import variance_of_new_shapes
 from shapespace.geometry.normals import vertex_normals
 from shapespace.io.files import write_text
 from shapespace.io.meshes.mesh_io import write_mesh
-from shapespace.report.analyses.result_tables import analysis_report
+from shapespace.report.analyses.result_report import analysis_report
 from shapespace.schemas import Analysis
 from shapespace.statistics.score_subjects import ScoreConfig, ScoreResult, score
 from shapespace.types import FloatArray, Mesh

@@ -11,7 +11,7 @@ from scipy.stats import t
 from shapespace import errors
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.table import Table, numbers_as_text
-from shapespace.report.analyses.shape_prediction_report import shape_prediction_report
+from shapespace.report.analyses.regression_report import shape_prediction_report
 from shapespace.statistics.compare_shapes import CompareConfig, compare
 from shapespace.statistics.shape_prediction import ShapePrediction, predict_shapes
 from shapespace.statistics.subject_regression import SubjectRegression

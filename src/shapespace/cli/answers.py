@@ -248,8 +248,11 @@ def answer_regress(arguments: argparse.Namespace) -> Outcome:
     """Fit a regression on shape, predict with it, and write the report."""
     from shapespace.batch.progress import steps
     from shapespace.io.files import make_folder
-    from shapespace.report.analyses.regression_report import prediction_report, regression_report
-    from shapespace.report.analyses.shape_prediction_report import shape_prediction_report
+    from shapespace.report.analyses.regression_report import (
+        prediction_report,
+        regression_report,
+        shape_prediction_report,
+    )
     from shapespace.statistics.predictor import Predictor, refuse_known
     from shapespace.statistics.regression import regress
     from shapespace.statistics.shape_prediction import predict_shapes
@@ -305,7 +308,7 @@ def answer_score(arguments: argparse.Namespace) -> Outcome:
 
 def answer_shape_tests(arguments: argparse.Namespace) -> Outcome:
     """Run a test of shape on a cohort, and write its report."""
-    from shapespace.report.analyses.shape_test_report import shape_test_report
+    from shapespace.report.analyses.result_report import shape_test_report
 
     test = arguments.shape_test
     function = resolve_name(f"shapespace.statistics.shape_tests.{test.function}")

@@ -22,7 +22,7 @@ from shapespace.batch.workers import context
 
 if TYPE_CHECKING:
     from shapespace.model.shape_model import ShapeModel
-    from shapespace.report.inputs.staged_fit import StagedFit
+    from shapespace.report.inputs.saved_fits import StagedFit
 
 PREVIEW = "preview.bin"
 PICTURE = "fit.bin"

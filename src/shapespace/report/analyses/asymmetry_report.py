@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,14 +12,16 @@ from shapespace.errors import InputError
 from shapespace.geometry.distortion import factor_to_draw, flip_factor
 from shapespace.geometry.normals import rms_size
 from shapespace.report.analyses.analysis_report import (
+    MOST_LANDMARKS,
     REDUCED_MORPH_NOTE,
     AnalysisReport,
     Column,
     LengthFormat,
-    Table,
+    ResultTable,
+    blank_sentence,
+    cohort_report,
     histogram_part,
 )
-from shapespace.report.analyses.shape_data import MOST_LANDMARKS, blank_sentence, cohort_report
 from shapespace.schemas import DeformationPart, HistogramPart, MorphPart, Part, SurfaceMapPart, TextPart
 from shapespace.statistics.asymmetry import AnovaRow, AsymmetryResult, first_pattern
 from shapespace.statistics.observation_weights import blank_where
@@ -56,7 +58,7 @@ def asymmetry_report(result: AsymmetryResult) -> AnalysisReport:
             *pictures,
         ],
         cohort,
-        summary=_summary(result, order),
+        summary=tuple(_summary(result, order)),
         arrays={_FILE: arrays},
         meshes=_meshes(result, order),
         notes=(*cohort.notes, *result.sides.notes, *_limitation_notes(result)),
@@ -76,7 +78,7 @@ def asymmetry_report(result: AsymmetryResult) -> AnalysisReport:
     )
 
 
-def _summary(result: AsymmetryResult, order: Any) -> tuple[str, ...]:
+def _summary(result: AsymmetryResult, order: Any) -> Iterator[str]:
     mm, lengths = result.scores.mm, _lengths(result)
     side, interaction = result.effect("side"), result.effect("individual x side")
     directional = float(np.sqrt((result.directional**2).mean()))
@@ -88,18 +90,18 @@ def _summary(result: AsymmetryResult, order: Any) -> tuple[str, ...]:
         f"{lengths.text(float(np.median(mm)))} (median; 5 to 95 %: {lengths.number(float(np.percentile(mm, 5)))} to "
         f"{lengths.text(float(np.percentile(mm, 95)))})"
     )
-    sentences = [
-        f"{apart[0].upper()}{apart[1:]}, RMS {_direction(result)}.",
+    yield f"{apart[0].upper()}{apart[1:]}, RMS {_direction(result)}."
+    yield (
         f"On average the sides differ by {lengths.text(directional)} RMS (directional asymmetry): "
-        f"F = {_number_text(side.f)}, p = {_number_text(side.p)}.",
-    ]
+        f"F = {_number_text(side.f)}, p = {_number_text(side.p)}."
+    )
     if interaction.p is None and interaction.f is None:
-        sentences.append(
+        yield (
             "No subject was measured twice, so fluctuating asymmetry cannot be distinguished from measurement error, "
             "and the lengths contain both."
         )
     else:
-        sentences.append(
+        yield (
             f"Subjects differ in their asymmetry beyond measurement error (fluctuating asymmetry): "
             f"F = {_number_text(interaction.f)}, p = {_number_text(interaction.p)}; the error alone would be taken for "
             f"{lengths.text(result.scores.error_mm)} "
@@ -107,15 +109,14 @@ def _summary(result: AsymmetryResult, order: Any) -> tuple[str, ...]:
         )
     if result.permutations:
         n_significant = int((result.directional_p <= _ALPHA).sum())
-        sentences.append(
+        yield (
             f"Directional asymmetry is shown at {n_significant} of {len(result.mean)} vertices (family-wise p at most "
             f"{_ALPHA})."
             if n_significant
             else f"No vertex shows directional asymmetry (family-wise p above {_ALPHA} everywhere)."
         )
     first = int(order[0])
-    sentences.append(f"The most asymmetric is {result.subjects[first]} with {_score_text(result, first)}.")
-    return tuple(sentences)
+    yield f"The most asymmetric is {result.subjects[first]} with {_score_text(result, first)}."
 
 
 def _lengths(result: AsymmetryResult) -> LengthFormat:
@@ -161,35 +162,32 @@ def _method_sentences(result: AsymmetryResult) -> tuple[str, ...]:
     return (measured,) if sides.faces is None else (measured, maps)
 
 
-def _limitation_notes(result: AsymmetryResult) -> list[str]:
-    notes: list[str] = []
+def _limitation_notes(result: AsymmetryResult) -> Iterator[str]:
     subjects, repeats = len(result.subjects), int(result.counts.sum()) - len(result.subjects)
     least = 2.0 ** (1 - subjects)
     if least > _ALPHA / 5:
-        notes.append(
+        yield (
             f"{subjects} subjects are few: with random signs p cannot fall below {least:.2g} whatever the asymmetry."
         )
     if 0 < repeats < _FEWEST_REPEATS:
-        notes.append(
+        yield (
             f"The measurement error is known from {repeats} repeated shapes only, so intervals are rough; "
             f"{_FEWEST_REPEATS} are the least to go by."
         )
-    fitted = result.cohort.fitted
-    if fitted is not None:
-        notes.append(
+    if result.cohort.fitted is not None:
+        yield (
             "Fits hold asymmetry back where their model has little of it; docs/asymmetry.md says by how much. Dense "
             "surfaces (--set surfaces=dense) of a model built with mirrored shapes lose least."
         )
-    return notes
 
 
 def _number_text(value: float | None) -> str:
     return "not known" if value is None else f"{value:.3g}"
 
 
-def _anova_table(result: AsymmetryResult, title: str, anova: Sequence[AnovaRow], file: str, note: str) -> Table:
+def _anova_table(result: AsymmetryResult, title: str, anova: Sequence[AnovaRow], file: str, note: str) -> ResultTable:
     lengths = _lengths(result)
-    return Table(
+    return ResultTable(
         title=title,
         columns=(
             Column("source", field="source"),
@@ -213,10 +211,10 @@ def _histogram(result: AsymmetryResult) -> HistogramPart:
     )  # fmt: skip
 
 
-def _subject_table(result: AsymmetryResult, order: Any) -> Table:
+def _subject_table(result: AsymmetryResult, order: Any) -> ResultTable:
     s, v, lengths = result.scores, result.vertex_scores, _lengths(result)
     numbers = (s.mm, s.low, s.high, s.raw_mm, result.z, result.z_low, result.z_high)
-    return Table(
+    return ResultTable(
         title="The most asymmetric subjects" if len(order) > _MOST_ROWS else "Subjects",
         columns=(
             Column("subject", field="subject"), Column("shapes", "count", "shapes"),
@@ -247,7 +245,7 @@ def _vectors(mean: FloatArray, half_difference: FloatArray, arrays: dict[str, An
                             low_label="the mirrored mean", high_label="the mean", times=times),)  # fmt: skip
 
 
-def _maps_and_morphs(result: AsymmetryResult, order: Any) -> tuple[Mapping[str, Any], list[Part | Table]]:
+def _maps_and_morphs(result: AsymmetryResult, order: Any) -> tuple[Mapping[str, Any], list[Part | ResultTable]]:
     subjects = [int(k) for k in order[:_MOST_MAPS]]
     half_difference = result.difference.mean(axis=0) / 2.0
     arrays: dict[str, Any] = {
@@ -266,7 +264,7 @@ def _maps_and_morphs(result: AsymmetryResult, order: Any) -> tuple[Mapping[str, 
         return arrays, [_point_table(result), *_vectors(result.mean, half_difference, arrays)]
     arrays["faces"] = result.sides.faces
     untested = not result.permutations
-    parts: list[Part | Table] = [
+    parts: list[Part | ResultTable] = [
         SurfaceMapPart(
             title="Directional asymmetry", level=2, arrays=_FILE, values="directional_mm",
             mask="" if untested else "shown",
@@ -326,15 +324,20 @@ def _blank_note(result: AsymmetryResult) -> str:
     return "" if result.blank is None else f" {blank_sentence(int(result.blank.sum()), len(result.blank))}"
 
 
-def _point_table(result: AsymmetryResult) -> Table:
+def _point_table(result: AsymmetryResult) -> ResultTable:
     names = {vertex: name for name, vertex in (result.cohort.landmarks or SurfaceLandmarks()).items()}
     lengths, vertices = _lengths(result), map(int, result.sides.vertices)
-    columns = (Column("vertex"), lengths.column("directional"), Column("p", "p"), lengths.column("fluctuating"))
+    columns = (
+        Column("vertex"),
+        lengths.column("directional"),
+        Column("p", "p"),
+        lengths.column("fluctuating"),
+    )
     rows = zip(
         [names.get(v, str(v)) for v in vertices], result.directional, result.directional_p, result.fluctuating,
         strict=True,
     )  # fmt: skip
-    return Table(title="Vertices", columns=columns, rows=list(rows), note="p is family-wise.")
+    return ResultTable(title="Vertices", columns=columns, rows=list(rows), note="p is family-wise.")
 
 
 def _meshes(result: AsymmetryResult, order: Any) -> dict[str, Mesh]:

@@ -11,13 +11,19 @@ import numpy.typing as npt
 
 from shapespace.cohort.table import list_names
 from shapespace.geometry.distortion import factor_to_draw, flip_factor
-from shapespace.report.analyses.analysis_report import REDUCED_MORPH_NOTE, AnalysisReport, Column, Table
+from shapespace.report.analyses.analysis_report import (
+    REDUCED_MORPH_NOTE,
+    AnalysisReport,
+    Column,
+    ResultTable,
+    blank_sentence,
+    cohort_report,
+)
 from shapespace.report.analyses.methods_section import (
     dispersion_sentence,
     is_dispersion_warning,
     multiplicity_sentence,
 )
-from shapespace.report.analyses.shape_data import blank_sentence, cohort_report
 from shapespace.schemas import (
     CurvePart,
     MorphPart,
@@ -66,7 +72,7 @@ def change_report(change: ChangeResult) -> AnalysisReport:
         "faces": np.asarray(change.cohort.faces),
         "stable_share": np.mean([subject.stable for subject in change.subjects], axis=0),
     }
-    parts: list[Part | Table] = []
+    parts: list[Part | ResultTable] = []
     if change.mean_change is not None:
         parts += _mean_change_parts(change, change.mean_change, arrays)
     if change.group_difference is not None:
@@ -113,51 +119,49 @@ def change_report(change: ChangeResult) -> AnalysisReport:
     )
 
 
-def _summary(change: ChangeResult) -> list[str]:
+def _summary(change: ChangeResult) -> Iterator[str]:
     subjects = change.subjects
     rms = float(np.median([subject.rms_mm for subject in subjects]))
     share = 100 * float(np.median([subject.beyond_share for subject in subjects]))
     subjects_text = subjects[0].name if len(subjects) == 1 else f"{len(subjects)} subjects"
-    sentences = [
+    yield (
         f"{subjects_text} changed by {rms:.2f} mm (RMS along the "
         f"normals{'' if len(subjects) == 1 else ', median'}), and on "
         f"{share:.0f} % of the surface by more than its uncertainty, where noise alone gives 5 %."
-    ]
+    )
     if change.mean_change is not None:
         volumes = np.array([change_or_rate(one, rate=change.config.rate).volumes_mm3[0] for one in subjects])
         low, high = interval_of_mean(volumes)
         unit = _VolumeUnit.of(volumes.mean(), low, high)
-        sentences.append(_test_sentence(change, change.mean_change.surface, "the mean change", "none"))
+        yield _test_sentence(change, change.mean_change.surface, "the mean change", "none")
         verb = "The volume changed by" if change.is_closed else "The open surface swept"
-        sentences.append(
+        yield (
             f"{verb} {unit.text(volumes.mean())} {unit.name}{_per_time(change)} on average (95 %: {unit.text(low)} to "
             f"{unit.text(high)}), "
             f"{_p_text(float(change.mean_change.volumes.p[0]))}."
         )
     if change.group_difference is not None:
         first, second = change.group_difference.groups
-        sentences.append(
-            _test_sentence(change, change.group_difference.surface, f"the change of {second}", f"that of {first}")
-        )
+        yield _test_sentence(change, change.group_difference.surface, f"the change of {second}", f"that of {first}")
         difference = float(change.group_difference.volumes.effect[0])
         unit = _VolumeUnit.of(difference)
-        sentences.append(
+        yield (
             f"The volume of {second} changed by {unit.text(difference)} {unit.name}{_per_time(change)} "
             f"more than that of {first}, {_p_text(float(change.group_difference.volumes.p[0]))}."
         )
         unequal = change.group_difference.surface.unequal_variances
-        sentences += [
+        yield from (
             dispersion_sentence(one, unequal, "mm")
             for one in change.methods.dispersions
             if is_dispersion_warning(one, unequal_variances=unequal) or not one.equal
-        ]
+        )
     if change.repeatability is None:
-        sentences.append(f"There are no rescans, so what is noise is not measured. {_SOURCES[change.uncertainty]}")
+        yield f"There are no rescans, so what is noise is not measured. {_SOURCES[change.uncertainty]}"
     else:
         repeatability, smallest = change.repeatability, change.repeatability.smallest_mm
         least = float(repeatability.volumes_smallest_mm3[0])
         unit = _VolumeUnit.of(least)
-        sentences.append(
+        yield (
             f"By {repeatability.scans} scans of {repeatability.visits} "
             f"{'visit' if repeatability.visits == 1 else 'visits'} with rescans, the "
             f"smallest detectable change of one scan against another is {np.median(smallest):.2f} mm (median over the "
@@ -165,8 +169,7 @@ def _summary(change: ChangeResult) -> list[str]:
             "volume; less is noise."
         )
     if change.mean_change is not None:
-        sentences.append(multiplicity_sentence(change.methods))
-    return sentences
+        yield multiplicity_sentence(change.methods)
 
 
 @dataclass(frozen=True)
@@ -219,7 +222,7 @@ def _per_time(change: ChangeResult) -> str:
 
 def _mean_change_parts(
     change: ChangeResult, tests: MeanChangeTests, arrays: dict[str, npt.NDArray[Any]]
-) -> list[Part | Table]:
+) -> Iterator[Part | ResultTable]:
     test = tests.surface
     unit = f"mm{_per_time(change)}"
     arrays |= {
@@ -237,18 +240,15 @@ def _mean_change_parts(
         f"{test.permutations} sign flips{' (all there are)' if test.every else ''}; no p can be below {least:.2g}."
     )
     note = f"Mean of {test.n[0]} subjects along the normals, outwards positive. {marked}{grey}"
-    parts: list[Part | Table] = [
-        SurfaceMapPart(
-            title="The mean change", level=2, arrays=ARRAYS, vertices="before", values="mean",
-            mask="" if least > _LEVEL else "mean_found", unit=unit, note=note,
-        ),
-        _morph("From before to after", arrays, "before", "after", "mean first visit", "mean with its change"),
-    ]  # fmt: skip
+    yield SurfaceMapPart(
+        title="The mean change", level=2, arrays=ARRAYS, vertices="before", values="mean",
+        mask="" if least > _LEVEL else "mean_found", unit=unit, note=note,
+    )  # fmt: skip
+    yield _morph("From before to after", arrays, "before", "after", "mean first visit", "mean with its change")
     if len(change.regions) > 1:
-        parts.append(_region_table(change, tests.volumes))
+        yield _region_table(change, tests.volumes)
     if tests.landmarks is not None:
-        parts.append(_landmark_table(change, tests.landmarks, unit))
-    return parts
+        yield _landmark_table(change, tests.landmarks, unit)
 
 
 def _region_table(change: ChangeResult, test: MapTest) -> Part:
@@ -262,11 +262,11 @@ def _region_table(change: ChangeResult, test: MapTest) -> Part:
     )  # fmt: skip
 
 
-def _landmark_table(change: ChangeResult, test: MapTest, unit: str) -> Table:
+def _landmark_table(change: ChangeResult, test: MapTest, unit: str) -> ResultTable:
     maps = np.stack([change_or_rate(one, rate=change.config.rate).along_mm for one in change.subjects])
     names = ("mean", "stddev", "low", "high")
     every = zip(change.landmarks.names, change.landmarks.interpolate(maps.T), test.p, strict=True)
-    return Table(
+    return ResultTable(
         title="Landmarks",
         columns=(
             Column("landmark", field="landmark"), *(Column(one, "mm", one) for one in names), Column("p", "p", "p"),
@@ -350,7 +350,7 @@ def _noise_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) -> l
     ]  # fmt: skip
 
 
-def _subject_table(change: ChangeResult) -> Table:
+def _subject_table(change: ChangeResult) -> ResultTable:
     every = len(change.subjects)
     more = f" The first {MOST_ROWS} of {every}; all are in subjects.csv." if every > MOST_ROWS else ""
     unit = _VolumeUnit.of(*(one.change.volumes_mm3[0] for one in change.subjects[:MOST_ROWS]))
@@ -386,14 +386,14 @@ def _subject_table(change: ChangeResult) -> Table:
                 change.time_unit,
             ]
         rows.append(row)
-    return Table(
+    return ResultTable(
         title="Subjects", level=2, columns=columns, rows=rows, file="subjects.csv", shown=range(MOST_ROWS),
         note=f"Last visit less first. {_SOURCES[change.uncertainty]}{more}",
     )  # fmt: skip
 
 
-def _subject_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) -> list[Part | Table]:
-    parts: list[Part | Table] = [_subject_table(change)]
+def _subject_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) -> Iterator[Part | ResultTable]:
+    yield _subject_table(change)
     most = sorted(change.subjects, key=lambda one: -one.beyond_share)[:MOST_MAPS]
     for number, subject in enumerate(most, 1):
         before, after = change.surfaces(subject.name)
@@ -404,24 +404,19 @@ def _subject_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) ->
             f"{key}_change": blank_where(subject.change.along_mm, subject.unobserved),
             f"{key}_beyond": subject.change.beyond,
         }
-        parts.append(
-            SurfaceMapPart(
-                title=f"{subject.name}, {subject.visits[0].label} to {subject.visits[-1].label}", arrays=ARRAYS,
-                vertices=f"{key}_before", values=f"{key}_change", mask=f"{key}_beyond",
-                note=f"Outwards positive; in full colour where it exceeds {subject.change.quantile:.2f} standard "
-                f"deviations (median of these {np.median(subject.change.stddev_mm):.2f} mm).",
-            )
+        yield SurfaceMapPart(
+            title=f"{subject.name}, {subject.visits[0].label} to {subject.visits[-1].label}", arrays=ARRAYS,
+            vertices=f"{key}_before", values=f"{key}_change", mask=f"{key}_beyond",
+            note=f"Outwards positive; in full colour where it exceeds {subject.change.quantile:.2f} standard "
+            f"deviations (median of these {np.median(subject.change.stddev_mm):.2f} mm).",
         )  # fmt: skip
         if number == 1:
-            parts.append(
-                _morph(
-                    f"{subject.name} from before to after", arrays, f"{key}_before", f"{key}_after",
-                    subject.visits[0].label, subject.visits[-1].label,
-                )
+            yield _morph(
+                f"{subject.name} from before to after", arrays, f"{key}_before", f"{key}_after",
+                subject.visits[0].label, subject.visits[-1].label,
             )  # fmt: skip
     if len(change.subjects) > MOST_MAPS:
-        parts.append(TextPart(text=f"Maps of all {len(change.subjects)} subjects are in {MAPS}."))
-    return parts
+        yield TextPart(text=f"Maps of all {len(change.subjects)} subjects are in {MAPS}.")
 
 
 def _morph(
@@ -465,9 +460,9 @@ def _time_series(change: ChangeResult) -> list[Part]:
     ]
 
 
-def _file_tables(change: ChangeResult) -> Iterator[Table]:
+def _file_tables(change: ChangeResult) -> Iterator[ResultTable]:
     """Yield the tables that are files alone."""
-    yield Table.of_fields(
+    yield ResultTable.of_fields(
         "visits.csv",
         ("subject", "visit", "time", "scans", "rms_since_first_mm", "volume_since_first_mm3"),
         [
@@ -477,7 +472,7 @@ def _file_tables(change: ChangeResult) -> Iterator[Table]:
         ],
     )
     if len(change.regions) > 1:
-        yield Table.of_fields(
+        yield ResultTable.of_fields(
             "regions.csv",
             ("subject", "region", "volume_change_mm3", "stddev_mm3"),
             [
@@ -487,7 +482,7 @@ def _file_tables(change: ChangeResult) -> Iterator[Table]:
             ],
         )
     if change.landmarks:
-        yield Table.of_fields(
+        yield ResultTable.of_fields(
             "landmarks.csv",
             ("subject", "landmark", "x_mm", "y_mm", "z_mm", "moved_mm", "stddev_mm", "along_normal_mm",
              "along_normal_stddev_mm", "smallest_detectable_mm"),
@@ -533,19 +528,17 @@ def _maps(change: ChangeResult) -> dict[str, npt.NDArray[Any]]:
     }
 
 
-def _notes(change: ChangeResult) -> list[str]:
-    notes: list[str] = []
+def _notes(change: ChangeResult) -> Iterator[str]:
     if change.single_visit_subjects:
         alone, every = len(change.single_visit_subjects), len(change.subjects) + len(change.single_visit_subjects)
         names = list_names(change.single_visit_subjects)
-        notes.append(f"{alone} of {every} subjects are left out, who have one visit ({names}).")
+        yield f"{alone} of {every} subjects are left out, who have one visit ({names})."
     ends = {(one.visits[0].label, one.visits[-1].label) for one in change.subjects}
     if not change.time_unit and len(ends) > 1:
         pairs_of_visits = list_names([f"{first} to {last}" for first, last in sorted(ends)])
-        notes.append(f"Not all subjects have the same first and last visit ({pairs_of_visits}).")
+        yield f"Not all subjects have the same first and last visit ({pairs_of_visits})."
     if change.is_model_only:
-        notes.append(
+        yield (
             "The surfaces are the model's own, so what it cannot make of a change is not there; fit with --dense, and "
             "give --set surfaces=dense."
         )
-    return notes

@@ -15,9 +15,12 @@ from shapespace.report.analyses.analysis_report import (
     AnalysisReport,
     Column,
     LengthFormat,
-    Table,
+    ResultTable,
+    blank_sentence,
+    cohort_report,
     floats,
     histogram_part,
+    shape_change_parts,
 )
 from shapespace.report.analyses.methods_section import (
     bias_of_p,
@@ -27,7 +30,6 @@ from shapespace.report.analyses.methods_section import (
     multiplicity_sentence,
 )
 from shapespace.report.analyses.morphospace_report import compared_morphospace
-from shapespace.report.analyses.shape_data import blank_sentence, cohort_report, shape_change_parts
 from shapespace.schemas import CurvePart, Part, Series, SurfaceMapPart, TextPart
 from shapespace.statistics.compare_maps import EffectMap, Tested
 from shapespace.statistics.compare_shapes import MOST_LEVELS, CompareResult, ShapeEffect, TermTest
@@ -51,7 +53,7 @@ def compare_report(result: CompareResult) -> AnalysisReport:
     effects, config = result.effects, result.config
     morphospace, plotted = compared_morphospace(result)
     arrays = {f"effect_{number}.npz": _arrays(result, effect) for number, effect in enumerate(effects, 1)}
-    content: list[Part | Table] = [
+    content: list[Part | ResultTable] = [
         _term_table(result),
         *_term_histograms(result),
         _effect_table(result),
@@ -301,7 +303,7 @@ def _near_landmark(cohort: Cohort, vertex: int) -> str:
     return f" at landmark {name}" if cohort.source.kind == "landmarks" else f" near {name}"
 
 
-def _term_table(result: CompareResult) -> Table:
+def _term_table(result: CompareResult) -> ResultTable:
     strata, lengths, config = (
         any(test.stratum for test in result.tests),
         LengthFormat(result.cohort.unit),
@@ -324,7 +326,7 @@ def _term_table(result: CompareResult) -> Table:
         ]
     other = "equal" if result.unequal_variances else "unequal"
     has_other = any(test.p_other is not None for test in result.tests)
-    return Table(
+    return ResultTable(
         title="What shape varies with",
         level=2,
         columns=(
@@ -354,10 +356,10 @@ def _term_histograms(result: CompareResult) -> Iterator[Part]:
         )  # fmt: skip
 
 
-def _effect_table(result: CompareResult) -> Table:
+def _effect_table(result: CompareResult) -> ResultTable:
     pairs, lengths = Counter(effect.name for effect in result.effects), LengthFormat(result.cohort.unit)
     several = max(pairs.values(), default=0) > 1
-    return Table(
+    return ResultTable(
         title="How far apart",
         level=2,
         note="Distances of least-squares means: one variable changes, the others stay. The Procrustes distance is "
@@ -378,9 +380,9 @@ def _effect_table(result: CompareResult) -> Table:
     )  # fmt: skip
 
 
-def _angle_tables(result: CompareResult) -> Iterator[Table]:
+def _angle_tables(result: CompareResult) -> Iterator[ResultTable]:
     if result.angles:
-        yield Table(
+        yield ResultTable(
             title="Angles between changes of shape",
             note="0° is the same change, 90° nothing in common, 180° the opposite; p is that of parallel changes"
             f"{', not known where both are no longer than noise' if any(a.unknown_p for a in result.angles) else ''}.",

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from shapespace.fit.completion.complete import ESTIMATED, OBSERVED, UNKNOWABLE, Completion, CompletionConfig
 from shapespace.geometry.closest import build_engine
-from shapespace.report.analyses.analysis_report import AnalysisReport, Column, Table
+from shapespace.report.analyses.analysis_report import AnalysisReport, Column, ResultTable
 from shapespace.report.render.scene import decimate
 from shapespace.reprs import first_names
 from shapespace.schemas import MorphPart, Part, SurfaceMapPart, TextPart
@@ -90,7 +90,7 @@ class CompletionReport:
         settings = {"samples": self.config.samples, "seed": self.config.seed, "mirror": self.config.mirror,
                     "part": self.config.part, "with_doubtful": self.config.with_doubtful}  # fmt: skip
         count = len(self._rows)
-        scans = Table(
+        scans = ResultTable(
             title="Scans",
             columns=(
                 Column("scan", field="scan"), Column("status", field="status"),
@@ -104,7 +104,7 @@ class CompletionReport:
             "Unknowable: it is not.",
             file="completions.csv",
         )  # fmt: skip
-        quantities = Table(
+        quantities = ResultTable(
             title="Quantities",
             columns=(
                 Column("scan", field="scan"), Column("quantity", field="quantity"), Column("unit", field="unit"),
@@ -118,7 +118,7 @@ class CompletionReport:
             file="estimates.csv",
         )  # fmt: skip
         fields = ("scan", "landmark", *(f"{axis}_mm" for axis in "xyz"), *(f"stddev_{axis}_mm" for axis in "xyz"))
-        landmarks = [Table.of_fields("landmarks.csv", fields, self._landmarks)] if self._landmarks else []
+        landmarks = [ResultTable.of_fields("landmarks.csv", fields, self._landmarks)] if self._landmarks else []
         method = TextPart(title="Method", level=2, text=self._method())
         return AnalysisReport.of(
             "complete",

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from shapespace.cohort.proportions import zero_bound
-from shapespace.report.analyses.analysis_report import AnalysisReport, Table, histogram_part
-from shapespace.report.analyses.shape_data import cohort_report
+from shapespace.report.analyses.analysis_report import AnalysisReport, ResultTable, cohort_report, histogram_part
 from shapespace.schemas import CurvePart, HistogramPart, Part, Series, TablePart, TextPart
 from shapespace.statistics.identity.identify import IdentificationRates, IdentificationResult
 from shapespace.statistics.identity.rates import RateEstimate
@@ -153,8 +152,8 @@ def _identity_report(
         f"Who is it? {title}",
         [
             *parts,
-            Table.of_fields("figures.csv", ("score", "figure", "value", "low", "high"), figures),
-            Table.of_fields("scans.csv", ("scan", "subject", "role"), scans),
+            ResultTable.of_fields("figures.csv", ("score", "figure", "value", "low", "high"), figures),
+            ResultTable.of_fields("scans.csv", ("scan", "subject", "role"), scans),
         ],
         trial.cohort,
         summary=tuple(filter(None, (*summary, measured))),
@@ -187,6 +186,10 @@ def _interval(one: RateEstimate) -> tuple[float, float] | None:
 
 def _cells(one: RateEstimate) -> tuple[float | None, float | None, float | None]:
     return one.value, one.low, one.high
+
+
+def _cells_with_intervals(estimates: Iterable[RateEstimate]) -> tuple[object, ...]:
+    return tuple(cell for one in estimates for cell in (one.value, _interval(one)))
 
 
 def _thin_curve(x: FloatArray, y: FloatArray, label: str) -> Series:
@@ -223,21 +226,20 @@ def _no_error_sentence(errors: bool, people: int) -> str:
 
 
 def _identification_rows(one: IdentificationRates) -> list[Sequence[object]]:
-    rows: list[Sequence[object]] = [[one.name, "rank 1", *_cells(one.rank_1)]]
-    rows += [[one.name, f"within {k}", share, *ends] for k, (share, *ends) in enumerate(
-        zip(one.cmc.tolist(), *one.band.tolist(), strict=True), 1)]  # fmt: skip
-    rows += [[one.name, f"fnir at fpir {rate:g}", *_cells(estimate)] for rate, estimate in one.fnir.items()]
-    return rows
+    ranks = enumerate(zip(one.cmc.tolist(), *one.band.tolist(), strict=True), 1)
+    return [
+        [one.name, "rank 1", *_cells(one.rank_1)],
+        *([one.name, f"within {k}", share, *ends] for k, (share, *ends) in ranks),
+        *([one.name, f"fnir at fpir {rate:g}", *_cells(estimate)] for rate, estimate in one.fnir.items()),
+    ]
 
 
 def _identification_parts(result: IdentificationResult) -> tuple[Part, ...]:
     rates = ["first", *(f"FNIR at FPIR {rate:g}" for rate in result.scores[0].fnir)]
     columns = ["score", *(name for rate in rates for name in (rate, "95 %"))]
     rows = tuple(
-        (_score_label(one.name), one.rank_1.value, _interval(one.rank_1),
-         *(cell for estimate in one.fnir.values() for cell in (estimate.value, _interval(estimate))))
-        for one in result.scores
-    )  # fmt: skip
+        (_score_label(one.name), *_cells_with_intervals((one.rank_1, *one.fnir.values()))) for one in result.scores
+    )
     ranks = tuple(float(k) for k in range(1, result.enrolled + 1))
     return (
         TablePart.of(
@@ -269,61 +271,53 @@ def _identification_parts(result: IdentificationResult) -> tuple[Part, ...]:
     )  # fmt: skip
 
 
-def _verification_rows(one: VerificationRates) -> list[Sequence[object]]:
-    rows: list[Sequence[object]] = [[one.name, "eer", *_cells(one.eer)]]
-    rows += [[one.name, f"tar at far {far:g}", *_cells(estimate)] for far, estimate in one.tar.items()]
-    rows += [[one.name, "cllr", *_cells(one.cllr)], [one.name, "cllr_min", one.cllr_min, None, None]]
-    rows += [[one.name, f"eer with {modes} modes", eer, None, None] for modes, eer in one.curve.items()]
+def _verification_rows(one: VerificationRates) -> Iterator[Sequence[object]]:
+    yield one.name, "eer", *_cells(one.eer)
+    yield from ((one.name, f"tar at far {far:g}", *_cells(estimate)) for far, estimate in one.tar.items())
+    yield one.name, "cllr", *_cells(one.cllr)
+    yield one.name, "cllr_min", one.cllr_min, None, None
+    yield from ((one.name, f"eer with {modes} modes", eer, None, None) for modes, eer in one.curve.items())
     for value, part in one.by.items():
-        rows.append([one.name, f"eer of {value}", *_cells(part.eer)])
-        rows += [[one.name, f"tar at far {far:g} of {value}", *_cells(estimate)] for far, estimate in part.tar.items()]
-    return rows
+        yield one.name, f"eer of {value}", *_cells(part.eer)
+        for far, estimate in part.tar.items():
+            yield one.name, f"tar at far {far:g} of {value}", *_cells(estimate)
 
 
-def _verification_parts(result: VerificationResult) -> tuple[Part, ...]:
-    parts: list[Part] = [_rates_table(result), _det_curve(result), _roc_curve(result)]
+def _verification_parts(result: VerificationResult) -> Iterator[Part]:
+    yield from (_rates_table(result), _det_curve(result), _roc_curve(result))
     if any(one.curve for one in result.scores):
-        parts.append(
-            CurvePart(
-                title="Equal error rate by the number of modes",
-                note="Leading coefficients of identity; the plain distance uses the whole shapes.",
-                series=tuple(
-                    Series(x=tuple(map(float, one.curve)), y=tuple(one.curve.values()), label=_score_label(one.name))
-                    for one in result.scores
-                ),
-                x="modes",
-                y="equal error rate",
-                x_scale="log",
-            )
+        yield CurvePart(
+            title="Equal error rate by the number of modes",
+            note="Leading coefficients of identity; the plain distance uses the whole shapes.",
+            series=tuple(
+                Series(x=tuple(map(float, one.curve)), y=tuple(one.curve.values()), label=_score_label(one.name))
+                for one in result.scores
+            ),
+            x="modes",
+            y="equal error rate",
+            x_scale="log",
         )
     if any(one.by for one in result.scores):
-        parts.append(_subgroup_table(result))
-    parts += [_histogram(one, result) for one in result.scores[:2]]
-    parts.append(
-        TextPart(
-            title="How it was measured",
-            text=(
-                _subjects_sentence(result.trial, result.trained_on),
-                f"{_INTERVALS} Scores, PLDA scores among them, are not likelihood ratios until they are calibrated, by "
-                "a logistic regression on pairs of subjects of other groups. Whether the shape model "
-                "was built from subjects tested here cannot be seen from its file; it must not have been.",
-            ),
-        )
+        yield _subgroup_table(result)
+    yield from (_histogram(one, result) for one in result.scores[:2])
+    yield TextPart(
+        title="How it was measured",
+        text=(
+            _subjects_sentence(result.trial, result.trained_on),
+            f"{_INTERVALS} Scores, PLDA scores among them, are not likelihood ratios until they are calibrated, by a "
+            "logistic regression on pairs of subjects of other groups. Whether the shape model was built from subjects "
+            "tested here cannot be seen from its file; it must not have been.",
+        ),
     )
-    return tuple(parts)
 
 
 def _rates_table(result: VerificationResult) -> TablePart:
     rates = ["EER", *(f"TAR at FAR {far:g}" for far in FAR)]
     columns = ["score", *(name for rate in rates for name in (rate, "95 %")), "Cllr, bits", "Cllr-min, bits"]
-    rows: list[tuple[object, ...]] = []
-    for one in result.scores:
-        figure_cells = [
-            cell
-            for rate_estimate in (one.eer, *one.tar.values())
-            for cell in (rate_estimate.value, _interval(rate_estimate))
-        ]
-        rows.append((_score_label(one.name), *figure_cells, one.cllr.value, one.cllr_min))
+    rows = tuple(
+        (_score_label(one.name), *_cells_with_intervals((one.eer, *one.tar.values())), one.cllr.value, one.cllr_min)
+        for one in result.scores
+    )
     return TablePart.of(
         "Verification rates", columns, rows, percent=rates,
         note="EER: error rate where false rejection and false acceptance are equal. TAR: pairs of one subject "
@@ -378,8 +372,7 @@ def _subgroup_table(result: VerificationResult) -> TablePart:
     rates = ("EER", "TAR at FAR 0.01")
     columns = (result.config.by or "", "score", "pairs of one", "pairs of two", rates[0], "95 %", rates[1], "95 %")
     rows = [
-        (value, _score_label(one.name), part.genuine, part.impostor, part.eer.value, _interval(part.eer),
-         part.tar[1e-2].value, _interval(part.tar[1e-2]))
+        (value, _score_label(one.name), part.genuine, part.impostor, *_cells_with_intervals((part.eer, part.tar[1e-2])))
         for value in (result.scores[0].by)
         for one in result.scores
         for part in (one.by[value],)

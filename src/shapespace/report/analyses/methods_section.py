@@ -200,12 +200,8 @@ def _tested_text(test: TestScheme) -> str:
     return f"{tested}{stratum}{f' ({test.statistic})' if test.statistic else ''}"
 
 
-def methods_parts(methods: Methods) -> tuple[Part, ...]:
-    """Return the parts of a report that state the methods of an analysis."""
-    return tuple(_parts(methods))
-
-
-def _parts(methods: Methods) -> Iterator[Part]:
+def methods_parts(methods: Methods) -> Iterator[Part]:
+    """Yield the parts of a report that state the methods of an analysis."""
     yield TextPart(title="Methods", level=2, text=tuple(_sentences(methods)))
     if methods.sizes:
         sizes = [

@@ -10,8 +10,15 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import InputError
-from shapespace.report.analyses.analysis_report import AnalysisReport, Column, LengthFormat, Table
-from shapespace.report.analyses.shape_data import cohort_report, scree_part, tangent_parts
+from shapespace.report.analyses.analysis_report import (
+    AnalysisReport,
+    Column,
+    LengthFormat,
+    ResultTable,
+    cohort_report,
+    scree_part,
+    tangent_parts,
+)
 from shapespace.schemas import ConfusionPart, MorphospacePart
 from shapespace.statistics.compare_shapes import CompareResult
 from shapespace.statistics.methods import methods_of, sample_sizes
@@ -182,7 +189,7 @@ def _confusion_parts(result: Ordination) -> Iterator[ConfusionPart]:
         yield ConfusionPart(title="Leave-one-out classification", classes=result.groups.names, counts=rows)
 
 
-def _eigenvalue_table(result: Ordination) -> Table:
+def _eigenvalue_table(result: Ordination) -> ResultTable:
     shares = result.explained_variance_ratio
     values = [result.eigenvalues, shares, shares.cumsum()]
     kinds: dict[str, Any] = {"axis": "text", "eigenvalue": "number", "share": "percent", "cumulative": "percent"}
@@ -190,7 +197,7 @@ def _eigenvalue_table(result: Ordination) -> Table:
         values.append(np.sqrt(result.eigenvalues / result.cohort.n_vertices))
         kinds[LengthFormat(result.cohort.unit).label("standard deviation, RMS per point")] = "number"
     columns = [Column(name, kind, name) for name, kind in kinds.items()]
-    return Table(
+    return ResultTable(
         title="Eigenvalues", columns=columns, rows=list(zip(result.names, *values, strict=True)), file="eigenvalues.csv"
     )
 
@@ -199,7 +206,7 @@ def _classes(result: Ordination, codes: npt.NDArray[Any]) -> list[str]:
     return [] if result.groups is None else [result.groups.names[int(code)] for code in codes]
 
 
-def _file_tables(result: Ordination) -> tuple[Table, Table]:
+def _file_tables(result: Ordination) -> tuple[ResultTable, ResultTable]:
     """Return the tables of scores and loadings, which are files alone."""
     cohort, names, shown = result.cohort, result.names, result.names[:_SHOWN_AXES]
     columns: dict[str, Any] = {"name": cohort.names, **dict(zip(names, result.scores.T, strict=True))}
@@ -217,8 +224,8 @@ def _file_tables(result: Ordination) -> tuple[Table, Table]:
     points = cohort.landmarks.names if is_landmarks and cohort.landmarks else range(cohort.n_vertices)
     rows = [(point, "xyz"[d], *values[3 * v + d]) for v, point in enumerate(points) for d in range(cohort.dimensions)]
     return (
-        Table.of_fields("scores.csv", tuple(columns), list(zip(*columns.values(), strict=True))),
-        Table.of_fields(
+        ResultTable.of_fields("scores.csv", tuple(columns), list(zip(*columns.values(), strict=True))),
+        ResultTable.of_fields(
             "loadings.csv", ("point", "coordinate", *(f"{name}{kind}" for kind in loadings for name in shown)), rows
         ),
     )

@@ -1,17 +1,26 @@
-"""Report of a regression on shape, and of predictions: sentences, tables and pictures."""
+"""Reports of a regression on shape, of predictions, and of mean shapes along a number: sentences, tables, pictures."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from shapespace.cohort.cohort import Cohort, subjects_of
-from shapespace.report.analyses.analysis_report import AnalysisReport, Column, Table
-from shapespace.report.analyses.shape_data import cohort_report
-from shapespace.report.analyses.shape_prediction_report import SHAPES_FILE, shape_prediction_parts
-from shapespace.schemas import CurvePart, Part, Series, TablePart, TextPart
+from shapespace.report.analyses.analysis_report import (
+    AnalysisReport,
+    Column,
+    LengthFormat,
+    ResultTable,
+    cohort_report,
+    floats,
+    shape_change_parts,
+)
+from shapespace.schemas import CurvePart, MorphPart, Part, Series, SurfaceMapPart, TablePart, TextPart
 from shapespace.statistics.methods import methods_of
+from shapespace.statistics.observation_weights import blank_where, weights_of
 from shapespace.statistics.predictor import Predictions, Predictor
 from shapespace.statistics.regression import (
     SMALL,
@@ -21,6 +30,8 @@ from shapespace.statistics.regression import (
     permutation_scheme,
     share_of,
 )
+from shapespace.statistics.shape_prediction import ShapePrediction
+from shapespace.types import FloatArray, Mesh
 
 _CITATIONS = (
     "Barber R. F., Candès E. J., Ramdas A., Tibshirani R. J. (2021) Predictive inference with the jackknife+. Annals "
@@ -44,7 +55,7 @@ def regression_report(result: RegressionResult, new: tuple[Cohort, Predictions] 
             *_file_tables(result),
         ],
         result.cohort,
-        summary=_summary(result, new),
+        summary=tuple(_summary(result, new)),
         arrays={SHAPES_FILE: arrays},
         meshes=meshes,
         notes=(*result.cohort.notes, *(() if new is None else new[0].notes)),
@@ -84,45 +95,46 @@ def prediction_report(predictor: Predictor, cohort: Cohort, predictions: Predict
     )
 
 
-def _summary(result: RegressionResult, new: tuple[Cohort, Predictions] | None) -> tuple[str, ...]:
+def _summary(result: RegressionResult, new: tuple[Cohort, Predictions] | None) -> Iterator[str]:
     m, level = result.measures, f"{100 * result.confidence:.0f} %"
-    sentences = [
+    yield (
         f"Shape predicts {result.target} of subjects left out with an RMSE of {m['rmse'].value:.3g} "
         f"({level} interval {_interval_text(m['rmse'])}), beside {result.baseline_rmse:.3g} by the mean alone: "
         f"R² = {m['r2'].value:.2f} ({_interval_text(m['r2'])})"
-        + ("." if result.p is None else f", p = {result.p:.2g}."),
+        + ("." if result.p is None else f", p = {result.p:.2g}.")
+    )
+    if result.small:
+        yield (
+            f"{result.n_subjects} subjects are a small sample (fewer than {SMALL}): another would give other figures, "
+            "within the intervals stated."
+        )
+    yield (
         f"{level} intervals are {m['width'].value:.3g} wide on average, and hold {100 * m['coverage'].value:.0f} % of "
         f"the subjects left out; the observed rises by {m['slope'].value:.2f} ({_interval_text(m['slope'])}) for "
-        "one predicted.",
+        "one predicted."
+    )
+    yield (
         f"The predictor uses {result.choice.words()}, {result.effective:.1f} degrees of freedom for "
-        f"{result.n_subjects} "
-        "subjects.",
-    ]
+        f"{result.n_subjects} subjects."
+    )
     if len(result.cohort) > result.n_subjects:
-        sentences.append(
+        yield (
             f"{len(result.cohort)} scans of {result.n_subjects} subjects: in means, fit, figures and intervals each "
-            "scan "
-            "has the weight 1 / number of scans of its subject."
+            "scan has the weight 1 / number of scans of its subject."
         )
     if result.p is not None:
-        sentences.append(permutation_scheme(result.subjects, result.observed))
-    if result.small:
-        sentences.insert(1, f"{result.n_subjects} subjects are a small sample (fewer than {SMALL}): another would "
-                            "give other figures, within the intervals stated.")  # fmt: skip
+        yield permutation_scheme(result.subjects, result.observed)
     if new is not None:
         cohort, predictions = new
-        sentences.append(
-            f"{len(predictions.names)} new shapes are predicted. {_outside_sentence(result.predictor, predictions)}"
-        )
+        yield f"{len(predictions.names)} new shapes are predicted. {_outside_sentence(result.predictor, predictions)}"
         observed = _observed_target(cohort, result.target)
         if observed is not None and len(observed) > 1:
             column = result.subject if result.subject in cohort.table.columns else None
             r2, rmse, coverage = compare_with(predictions, observed, share_of(subjects_of(cohort, column)))
-            sentences.append(
+            yield (
                 f"Their {result.target} is known: RMSE {rmse:.3g}, R² {r2:.2f}, and {100 * coverage:.0f} % lie in the "
                 f"{level} intervals."
             )
-    return tuple(sentences)
 
 
 def _outside_sentence(predictor: Predictor, predictions: Predictions) -> str:
@@ -175,24 +187,24 @@ def _calibration_part(result: RegressionResult) -> CurvePart:
     )  # fmt: skip
 
 
-def _file_tables(result: RegressionResult) -> tuple[Table, Table]:
+def _file_tables(result: RegressionResult) -> tuple[ResultTable, ResultTable]:
     """Return the tables of predictions and of measures, which are files alone."""
     columns = (result.observed, result.predicted, result.low, result.high, result.baseline)
     fields = ("scan", "subject", "observed", "predicted", "low", "high", "baseline")
     every = zip(result.cohort.names, result.subjects, *columns, strict=True)
     measures = [(name, m.value, m.low, m.high) for name, m in result.measures.items()]
     return (
-        Table.of_fields("predictions.csv", fields, list(every)),
-        Table.of_fields("measures.csv", ("measure", "value", "low", "high"), measures),
+        ResultTable.of_fields("predictions.csv", fields, list(every)),
+        ResultTable.of_fields("measures.csv", ("measure", "value", "low", "high"), measures),
     )
 
 
-def _new_tables(predictor: Predictor, new: tuple[Cohort, Predictions] | None) -> tuple[Part | Table, ...]:
+def _new_tables(predictor: Predictor, new: tuple[Cohort, Predictions] | None) -> tuple[Part | ResultTable, ...]:
     """Return the predictions of new shapes."""
     if new is None:
         return ()
     predictions = new[1]
-    table = Table(
+    table = ResultTable(
         title=f"{predictor.target} of new shapes" if predictions.names else "",
         columns=(
             Column("scan", field="scan"),
@@ -207,3 +219,167 @@ def _new_tables(predictor: Predictor, new: tuple[Cohort, Predictions] | None) ->
         shown=range(_MOST_ROWS),
     )
     return (table,) if predictions.names else (TextPart(title="New shapes", text="There are none."), table)
+
+
+SHAPES_FILE = "shapes.npz"
+"""Mean shapes, half widths of their intervals, and maps."""
+_SHAPE_CITATIONS = (
+    "Bell R. M., McCaffrey D. F. (2002) Bias reduction in standard errors for linear regression with multi-stage "
+    "samples. Survey Methodology 28, 169-181.",
+    "Imbens G. W., Kolesár M. (2016) Robust standard errors in small samples: some practical advice. Review of "
+    "Economics and Statistics 98, 701-712.",
+)
+
+
+def shape_prediction_report(result: ShapePrediction) -> AnalysisReport:
+    """Return the report of mean shapes along a number."""
+    parts, arrays, meshes = shape_prediction_parts(result)
+    return cohort_report(
+        "regress",
+        f"Shape along {result.along}",
+        [_value_table(result), *_measure_parts(result), *parts, *_landmark_tables(result)],
+        result.cohort,
+        summary=tuple(_shape_summary(result)),
+        arrays={SHAPES_FILE: arrays},
+        meshes=meshes,
+        settings={
+            "along": result.along, "formula": result.formula, "held": dict(result.held) or None,
+            "gauge": result.cohort.gauge, "shapes": len(result.cohort), "subjects": result.n_subjects,
+            "permutations": result.permutations, "level": result.confidence, "seed": result.seed,
+            "subject": result.subject,
+        },
+        methods=result.methods,
+        citations=_SHAPE_CITATIONS,
+    )  # fmt: skip
+
+
+def shape_prediction_parts(result: ShapePrediction) -> tuple[list[Part], dict[str, Any], dict[str, Mesh]]:
+    """Return the morph and the maps of mean shapes along a number, their arrays, and the meshes."""
+    cohort, unit = result.cohort, LengthFormat(result.cohort.unit).of_map
+    blank = weights_of(cohort.observed_share) == 0
+    low, high = cohort.vertices(result.path[0]), cohort.vertices(result.path[-1])
+    widths = [result.half_width_mm(k) for k in range(len(result.df))]
+    arrays: dict[str, Any] = {
+        "low": low, "high": high, "vertices": cohort.vertices(result.path[len(result.path) // 2]),
+        "values": result.values, "shapes": np.stack([cohort.vertices(own) for own in result.coefficients]),
+        "half_width_mm": np.stack(widths[:-1]), "per_unit_mm": blank_where(result.per_unit_mm, blank),
+        "per_unit_half_width_mm": widths[-1] / (result.ends[1] - result.ends[0]),
+    }  # fmt: skip
+    ends = [f"{result.along} {value:.3g}" for value in result.ends]
+    morph: dict[str, Any] = {
+        "title": f"Mean shape along {result.along}", "arrays": SHAPES_FILE, "low_label": ends[0], "high_label": ends[1]
+    }  # fmt: skip
+    if cohort.faces is None:
+        return list(shape_change_parts(cohort, **morph)), arrays, {}
+    weights, modes = _modes(result)
+    widest = int(np.argmax([np.nan_to_num(np.linalg.norm(width), nan=-1.0) for width in widths[:-1]]))
+    arrays |= {"faces": cohort.faces, "weights": weights, "modes": modes}
+    parts: list[Part] = [
+        MorphPart(**morph, modes="modes", weights="weights", variable=result.along, range=result.ends,
+                  note="The slider moves through the mean shapes."),
+        SurfaceMapPart(
+            title=f"Change of shape for one unit of {result.along}", arrays=SHAPES_FILE, unit=unit,
+            values="per_unit_mm",
+            note="Along the normals, mean of the change between both ends; shapespace compare tests where this is more "
+            "than chance.",
+        ),
+    ]  # fmt: skip
+    if result.is_known[widest]:
+        arrays["widest_mm"] = blank_where(widths[widest], blank)
+        parts.append(
+            SurfaceMapPart(
+                title=f"Half width of the interval at {result.along} {result.values[widest]:.4g}, the widest",
+                arrays=SHAPES_FILE, values="widest_mm", unit=unit, signed=False,
+                note=f"Pointwise {100 * result.confidence:g} % interval of the mean shape along the normals.",
+            )
+        )  # fmt: skip
+    name = re.sub(r"[^\w.-]+", "_", result.along)
+    meshes = {
+        f"{name}_{value:.6g}.ply": cohort.mesh(own, f"{result.along} {value:.6g}")
+        for value, own in zip(result.values.tolist(), result.coefficients, strict=True)
+    }
+    return parts, arrays, meshes
+
+
+def _modes(result: ShapePrediction) -> tuple[FloatArray, FloatArray]:
+    """Return weights (B, q) up to 1 and modes (q, V, 3), mm, of the path less its first shape."""
+    u, s, axes = np.linalg.svd(result.path - result.path[0], full_matrices=False)
+    count = max(int((s > 1e-9 * s[0]).sum()), 1)  # the rest is rounding
+    weights = u[:, :count] * s[:count]
+    largest = np.maximum(np.abs(weights).max(axis=0), 1e-300)
+    modes = (largest[:, None] * axes[:count]) @ result.cohort.basis
+    return weights / largest, modes.reshape(count, -1, 3)
+
+
+def _shape_summary(result: ShapePrediction) -> Iterator[str]:
+    lengths, along = LengthFormat(result.cohort.unit), result.along
+    change, error = map(lengths.text, result.change_mm)
+    ends = f"from {along} {result.ends[0]:.3g} to {result.ends[1]:.3g}"
+    p = "" if result.p is None else f" (p {result.p:.3g})"
+    owners = subjects_of(result.cohort, result.subject)
+    varies = len(set(zip(owners, result.observed.tolist(), strict=True))) > result.n_subjects
+    subjects = f"{'between and within' if varies else 'between'} {result.n_subjects} subjects"
+    limits = f"{subjects}{'' if varies else ', which were not followed'}"
+    known = "" if result.is_known.all() else "; some intervals are not known"
+    found = result.p is None or result.p <= result.methods.level
+    yield (
+        f"{f'Shape changes with {along}' if found else f'No change of shape with {along} is found'}{p}: {change} (RMS "
+        f"over vertices, standard error {error}) {ends}, {limits}{known}."
+    )
+    held = ", ".join(f"{name} {value}" for name, value in result.held.items())
+    yield (
+        f"Mean shapes are predicted at {along} {', '.join(f'{value:.4g}' for value in result.values)} by ~ "
+        f"{result.formula}{f', with {held}' if held else ''}; other numbers are at their mean, and classes count alike."
+    )
+    yield (
+        f"Intervals are pointwise {100 * result.confidence:g} % intervals of the mean shape; single subjects vary more."
+    )
+    if not result.is_known.all():
+        values = [f"{v:.4g}" for v, known in zip(result.values, result.is_known[:-1], strict=True) if not known]
+        yield (
+            f"Too few subjects determine the variance at {along} {', '.join(values) or 'of both ends'}, so the "
+            "interval there is not known."
+        )
+
+
+def _value_table(result: ShapePrediction) -> ResultTable:
+    lengths = LengthFormat(result.cohort.unit)
+    names = ["distance_from_first", "standard_error", "half_width"]
+    widths = [np.linalg.norm(result.half_width_mm(k)) for k in range(len(result.values))]
+    columns = [result.distance_mm, result.distance_std_mm, np.array(widths) / result.cohort.n_vertices**0.5]
+    for one in result.measures:
+        name = re.sub(r"\W+", "_", one.name)
+        names += [name, f"{name}_low", f"{name}_high"]
+        columns += [one.value, one.low, one.high]
+    return ResultTable(
+        title=f"Mean shapes along {result.along}", level=2, file="shapes.csv",
+        columns=(Column(result.along, "number", result.along),
+                 *(lengths.column(name.replace("_", " "), name) for name in names), Column(field="df")),
+        rows=list(zip(result.values, *columns, result.df[: len(result.values)], strict=True)),
+        note="RMS over vertices: distance from the first shape with its standard error, and half the width of the "
+        f"pointwise {100 * result.confidence:g} % interval. Empty where an interval is not known.",
+    )  # fmt: skip
+
+
+def _measure_parts(result: ShapePrediction) -> Iterator[Part]:
+    for one in result.measures:
+        low, high = ([None if np.isnan(v) else float(v) for v in end] for end in (one.low, one.high))
+        yield CurvePart(
+            title=f"{one.name.capitalize()} along {result.along}", x=result.along,
+            y=LengthFormat(result.cohort.unit).label(one.name),
+            series=(Series(x=floats(result.observed), y=floats(one.observed), label="shapes", points=True),
+                    Series(x=floats(result.values), y=floats(one.value), label="mean", low=tuple(low),
+                           high=tuple(high))),
+        )  # fmt: skip
+
+
+def _landmark_tables(result: ShapePrediction) -> Iterator[ResultTable]:
+    if result.cohort.source.kind == "landmarks" and result.cohort.landmarks is not None:
+        axes = "xyz"[: result.cohort.dimensions]
+        header = (result.along, "landmark", *axes, *(f"{axis}_{end}" for end in ("low", "high") for axis in axes))
+        points: list[tuple[object, ...]] = []
+        for k, value in enumerate(result.values):
+            shape, width = result.cohort.vertices(result.coefficients[k]), result.half_width_mm(k)
+            for name, *ends in zip(result.cohort.landmarks.names, shape, shape - width, shape + width, strict=True):
+                points.append((value, name, *(float(v) for end in ends for v in end[: len(axes)])))
+        yield ResultTable.of_fields("landmarks.csv", header, points)

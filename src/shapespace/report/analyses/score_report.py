@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.report.analyses.analysis_report import AnalysisReport, Column, LengthFormat, Table, histogram_part
-from shapespace.report.analyses.shape_data import cohort_report, shape_change_parts
+from shapespace.report.analyses.analysis_report import (
+    AnalysisReport,
+    Column,
+    LengthFormat,
+    ResultTable,
+    cohort_report,
+    histogram_part,
+    shape_change_parts,
+)
 from shapespace.report.blocks.wording import counted
 from shapespace.schemas import HistogramPart, Part, SurfaceMapPart, TextPart
 from shapespace.statistics.score_subjects import SMALL, ScoreResult
@@ -24,7 +32,7 @@ def score_report(result: ScoreResult) -> AnalysisReport:
     """Return scores with all that their report shows; subjects are numbered from 1 in the arrays."""
     # Those outside the known range are first, then those who lie farthest out.
     order = sorted(map(int, np.lexsort((-result.distance, result.farther))), key=lambda k: not result.outside[k])
-    content: list[Part | Table] = [
+    content: list[Part | ResultTable] = [
         TextPart(title="The subjects", level=2, text=_method_sentences(result)),
         _score_table(result),
         *_file_tables(result),
@@ -88,7 +96,7 @@ def _method_sentences(result: ScoreResult) -> tuple[str, ...]:
     )
 
 
-def _score_table(result: ScoreResult) -> Table:
+def _score_table(result: ScoreResult) -> ResultTable:
     lengths, sized = LengthFormat(result.subjects.unit), bool(np.isfinite(result.size_z).all())
     columns = [
         Column("Subject", field="subject"), Column("Distance (SD)", "number", "distance_sd"),
@@ -112,14 +120,14 @@ def _score_table(result: ScoreResult) -> Table:
         std = result.imputations.stddev
         columns += [Column(field="distance_imputation_sd"), Column(field="percentile_imputation_sd")]
         rows = [(*row, std["distance"][k], 100 * std["farther"][k]) for k, row in enumerate(rows)]
-    return Table(
+    return ResultTable(
         title="Scores", columns=columns, rows=rows, file="scores.csv",
         note="Percentiles: share of the reference's subjects who lie nearer to its mean. On average 4.6 % of the "
         "vertices of a usual shape lie beyond 2 SD.",
     )  # fmt: skip
 
 
-def _file_tables(result: ScoreResult) -> tuple[Table, Table]:
+def _file_tables(result: ScoreResult) -> tuple[ResultTable, ResultTable]:
     """Return the tables of the nearest subjects and of the reference, which are files alone."""
     field = LengthFormat(result.subjects.unit).field
     near = [
@@ -129,8 +137,8 @@ def _file_tables(result: ScoreResult) -> tuple[Table, Table]:
     ]
     reference = zip(result.reference_names, result.reference_distance, result.reference_rest_mm, strict=True)
     return (
-        Table.of_fields("nearest.csv", ("subject", "rank", "reference", "distance_sd", field("rms")), near),
-        Table.of_fields("reference.csv", ("reference", "distance_sd", field("rest")), list(reference)),
+        ResultTable.of_fields("nearest.csv", ("subject", "rank", "reference", "distance_sd", field("rms")), near),
+        ResultTable.of_fields("reference.csv", ("reference", "distance_sd", field("rest")), list(reference)),
     )
 
 
@@ -145,14 +153,14 @@ def _histogram(result: ScoreResult) -> HistogramPart:
     )  # fmt: skip
 
 
-def _maps(result: ScoreResult, order: list[int]) -> list[Part]:
+def _maps(result: ScoreResult, order: list[int]) -> Iterator[Part]:
     rest = len(order) - _MOST_MAPS
     text = (
         "How far each vertex lies from the reference's mean along its normal, in standard deviations of the reference"
         f"{'' if result.subjects.fitted is None else ' and what the fit is unsure of'}."
         f"{f' Maps of {rest} more are in {_FILE}.' if rest > 0 else ''}"
     )
-    parts: list[Part] = [TextPart(title="Maps", level=2, text=text)]
+    yield TextPart(title="Maps", level=2, text=text)
     for k in order[:_MOST_MAPS]:
         beyond = ""
         if math.isfinite(result.z_limit):
@@ -160,13 +168,10 @@ def _maps(result: ScoreResult, order: list[int]) -> list[Part]:
                 f"{int((np.abs(result.z[k]) > result.z_limit).sum()):,} of {int(np.isfinite(result.z[k]).sum()):,} "
                 f"vertices lie beyond {result.z_limit:.1f} standard deviations."
             )
-        parts.append(
-            SurfaceMapPart(
-                title=result.names[k], arrays=_FILE, values=f"z_{k + 1}", unit="standard deviations, outwards (+)",
-                limit=_LIMIT_SD, note=beyond,
-            )
+        yield SurfaceMapPart(
+            title=result.names[k], arrays=_FILE, values=f"z_{k + 1}", unit="standard deviations, outwards (+)",
+            limit=_LIMIT_SD, note=beyond,
         )  # fmt: skip
-    return parts
 
 
 def _morphs(result: ScoreResult, order: list[int]) -> list[Part]:

@@ -40,6 +40,7 @@ from shapespace.report.blocks.wording import (
     ORDER_OF_CONCERN,
     counted,
     isfinite,
+    known,
     listed,
     mm,
     percent,
@@ -48,8 +49,7 @@ from shapespace.report.blocks.wording import (
     training_text,
     words,
 )
-from shapespace.report.inputs.saved_fits import Direction, Measure, SavedFit
-from shapespace.report.inputs.staged_fit import REGIONS, StagedFit, measured_mm
+from shapespace.report.inputs.saved_fits import Direction, Measure, SavedFit, StagedFit, measured_mm
 from shapespace.report.pages.page import Page
 from shapespace.report.render import thumbnails
 from shapespace.report.render.scene import pack_fit, pack_model, pack_scatter, pack_surfaces
@@ -334,16 +334,7 @@ _OF_PAPER = {
 
 def region_shares(fit: StagedFit) -> str:
     """Return the share of each region in words, or that they are unknown if the stages were not saved."""
-    if fit.regions is None:
-        return "not saved"
-    return listed(
-        [
-            f"{name} {percent(float(share))}"
-            for name, share in zip(
-                REGIONS, (np.bincount(fit.regions, minlength=len(REGIONS)) / max(len(fit.regions), 1)), strict=True
-            )
-        ]
-    )
+    return listed([f"{name} {percent(share)}" for name, share in fit.region_shares.items()]) or "not saved"
 
 
 def fit_facts(fit: SavedFit) -> list[Block]:
@@ -575,11 +566,7 @@ def _distance(direction: Direction, measure: Measure) -> _Make:
 
 
 def _share(key: str) -> _Make:
-    def cell(fit: SavedFit) -> Cell:
-        share = getattr(fit.record.shown, key, None)
-        return number(nan if share is None else 100 * share, 0)
-
-    return cell
+    return lambda fit: number(100 * known(getattr(fit.record.shown, key, None)), 0)
 
 
 def _total(values: Mapping[str, float], digits: int) -> Cell:

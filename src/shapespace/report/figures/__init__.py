@@ -2,7 +2,7 @@
 
     import shapespace as ss
     from shapespace.report import figures
-    from shapespace.report.inputs.staged_fit import StagedFit
+    from shapespace.report.inputs.saved_fits import StagedFit
 
     result = ss.fit_scan(model, scan)
     figures.signed_maps(StagedFit.of(model, result)).savefig("distances.png")
@@ -76,7 +76,7 @@ if TYPE_CHECKING:
         over_time_figure,
         scatter_matrix,
     )
-    from shapespace.report.inputs.staged_fit import StagedFit
+    from shapespace.report.inputs.saved_fits import StagedFit
 
 __all__ = [
     "SIDE_DEG",
@@ -198,6 +198,6 @@ __getattr__, __dir__ = lazy_names(
             "scatter_matrix",
         ),
         "cohort.orientation": ("oriented",),
-        "report.inputs.staged_fit": ("StagedFit",),
+        "report.inputs.saved_fits": ("StagedFit",),
     },
 )

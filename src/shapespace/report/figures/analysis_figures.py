@@ -49,7 +49,7 @@ from shapespace.report.figures.draw import (
     view,
 )
 from shapespace.report.inputs.correspondence_folder import upright
-from shapespace.report.inputs.staged_fit import nice_ceiling
+from shapespace.report.inputs.saved_fits import nice_ceiling
 from shapespace.report.render.palette import CATEGORIES, DIVERGING, SEQUENTIAL, oklab
 from shapespace.report.render.renderer import Camera, Image, Layer, render, visible_triangles
 from shapespace.report.render.thumbnails import checker_layer, checker_places

@@ -38,7 +38,7 @@ from shapespace.report.blocks.wording import counted as counted
 from shapespace.report.blocks.wording import mm as mm
 from shapespace.report.blocks.wording import percent as percent
 from shapespace.report.blocks.wording import printable
-from shapespace.report.inputs.staged_fit import StagedFit, measured_mm
+from shapespace.report.inputs.saved_fits import StagedFit, measured_mm
 from shapespace.report.render.palette import DIVERGING, SCAN_COLOUR, SEQUENTIAL, Colour
 from shapespace.report.render.renderer import Camera, Image, Layer, point_spacing
 from shapespace.report.render.thumbnails import Still, encoded
@@ -69,6 +69,9 @@ _MOST_LINES = 4  # layout: lines of a caption
 _LEGEND_MARK = 3.6  # layout: width of an entry of a legend without its name, in sizes of its type
 # steps between tick labels, and how many labels fit beside each other
 _STEPS, _MOST_NUMBERS = (1, 5, 10, 20, 50, 100, 200, 500), 22
+
+
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")  # in the order of those of widget-morphospace-drawing.js
 
 
 @dataclass(frozen=True)
@@ -564,12 +567,6 @@ def empty_chart(title: str, text: str) -> Figure:
 def scan_over(mesh: Mesh) -> Layer:
     """Return the layer of a scan that lies over a model: points are drawn so small that the model is seen between."""
     return Layer(mesh, SCAN_COLOUR, point_radius_mm=None if mesh.faces is not None else 0.3 * point_spacing(mesh))
-
-
-def mean_mm(fit: StagedFit, stage: str = "final") -> float:
-    """Return the mean distance to the scan over the overlap; NaN without overlap."""
-    values = measured_mm(fit.model_to_scan_mm[stage])
-    return float(values.mean()) if len(values) else float("nan")
 
 
 def mean_words(fits: Sequence[StagedFit]) -> str:

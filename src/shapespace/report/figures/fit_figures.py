@@ -32,7 +32,6 @@ from shapespace.report.figures.draw import (
     grid,
     in_rows,
     legend,
-    mean_mm,
     mean_words,
     mm,
     number_axis,
@@ -46,7 +45,7 @@ from shapespace.report.figures.draw import (
     unknown,
     view,
 )
-from shapespace.report.inputs.staged_fit import StagedFit, measured_mm, nice_ceiling, scale_end
+from shapespace.report.inputs.saved_fits import StagedFit, mean_mm, measured_mm, nice_ceiling, scale_end
 from shapespace.report.render.palette import (
     BEYOND_COLOUR,
     CLAY,
@@ -60,7 +59,7 @@ from shapespace.report.render.palette import (
     Colour,
     as_hex,
 )
-from shapespace.report.render.renderer import Camera, Image, Layer, distance_layer, render, render_series
+from shapespace.report.render.renderer import Camera, Layer, distance_layer, render, render_series
 from shapespace.types import FloatArray, Mesh
 
 THRESHOLDS_MM = (2.0, 4.0, 6.0, 8.0, 10.0)
@@ -96,10 +95,9 @@ def stages_figure(fit: StagedFit, *, title: str = "") -> Figure:
         [Layer(fit.scan, SCAN_COLOUR)],
         *([layer] for layer in [Layer(mesh, _colour(stage)) for stage, mesh in fit.surfaces.items()]),
     ]
-    captions = ["scan", *(f"{_SHORT_STAGES.get(stage, stage)}\n{mm(mean_mm(fit, stage))}" for stage in fit.surfaces)]
     dense = ", and taken the rest of the way" if "dense" in fit.surfaces else ""
     return grid(
-        _from_two_sides(fit, layers, captions),
+        _from_two_sides(fit, layers, ["scan", *_stage_captions(fit)]),
         title=title
         or f"{short(fit.label)}: the scan, and the model before, after finding pose and after finding shape{dense}",
         note=mean_words([fit]),
@@ -110,12 +108,11 @@ def overlay_figure(fit: StagedFit, *, title: str = "") -> Figure:
     """Draw scan and model superimposed at each stage, from two sides (the paper's figures 4 to 7)."""
     scan = scan_over(fit.scan)
     layers = [[scan, Layer(mesh, _colour(stage))] for stage, mesh in fit.surfaces.items()]
-    captions = [f"{_SHORT_STAGES.get(stage, stage)}\n{mm(mean_mm(fit, stage))}" for stage in fit.surfaces]
     keys: list[tuple[str, Colour]] = [("scan", SCAN_COLOUR), ("model", MODEL_COLOUR)]
     if "dense" in fit.surfaces:
         keys.append(("dense surface", DENSE_COLOUR))
     return grid(
-        _from_two_sides(fit, layers, captions),
+        _from_two_sides(fit, layers, _stage_captions(fit)),
         title=title or f"{short(fit.label)}: scan and model over each other, the nearer one is seen",
         keys=keys,
         note=f"{mean_words([fit])} Where both mix finely, the fit is close.",
@@ -392,17 +389,21 @@ def regions_figure(fit: StagedFit, *, title: str = "") -> Figure:
     scan = Layer(fit.scan, SCAN_COLOUR)
     cameras, size = equal_views([(surroundings(fit), yaw) for _, yaw in (_SIDES[0], _SIDES[2])], 4)
     panels = [panel for camera in cameras for panel in render_series([[scan], [layer]], camera=camera, size=size)]
-    share = np.bincount(fit.regions, minlength=len(REGIONS)) / max(len(fit.regions), 1)
     return grid(
         [Row(panels, ["scan", "model"] * 2)],
         title=title or f"{short(fit.label)}: which parts of the model the scan decided",
         keys=[
-            (f"{_REGION_WORDS[name]} ({percent(float(share[k]))})", REGION_COLOURS[name])
-            for k, name in enumerate(REGIONS)
-            if share[k] > 0
+            (f"{_REGION_WORDS[name]} ({percent(share)})", REGION_COLOURS[name])
+            for name, share in fit.region_shares.items()
+            if share > 0
         ],
         note="In %: share of the model's vertices. What is not blue has only the model, and its neighbours, to go by.",
     )
+
+
+def _stage_captions(fit: StagedFit) -> list[str]:
+    means = {stage: mm(mean_mm(fit.model_to_scan_mm[stage])) for stage in fit.surfaces}
+    return [f"{_SHORT_STAGES.get(stage, stage)}\n{mean}" for stage, mean in means.items()]
 
 
 def _from_two_sides(fit: StagedFit, layers: Sequence[Sequence[Layer]], captions: Sequence[str]) -> list[Row]:
@@ -563,7 +564,7 @@ def portrait_figure(
         )
         captions = ["scan", "model, fitted", "both", "distance"] if k == 0 else []
         name = short(labels[k] if labels else fit.label, 60)
-        rows.append(Row(panels, captions, f"{name}: mean {mm(mean_mm(fit))}"))
+        rows.append(Row(panels, captions, f"{name}: mean {mm(mean_mm(distances))}"))
     return grid(
         rows,
         title=title,
@@ -578,11 +579,7 @@ def aligned_grid(
 ) -> Figure:
     """Draw scan and fitted model superimposed for many fits, in the order given."""
     return grid(
-        _caption_rows(
-            _equal_views(fits, columns, lambda fit: [scan_over(fit.scan), Layer(fit.surfaces["final"], MODEL_COLOUR)]),
-            fits,
-            columns,
-        ),
+        _equal_views(fits, columns, lambda fit: [scan_over(fit.scan), Layer(fit.surfaces["final"], MODEL_COLOUR)]),
         title=title,
         keys=[("scan", SCAN_COLOUR), ("model", MODEL_COLOUR)],
         note=mean_words(fits),
@@ -598,21 +595,10 @@ def distance_maps(
     known = np.concatenate([measured_mm(f.model_to_scan_mm["final"]) for f in fits])
     top = nice_ceiling(float(np.percentile(known, 99)) if len(known) else 1.0)
     return grid(
-        _caption_rows(
-            _equal_views(
-                fits,
-                columns,
-                lambda fit: [
-                    Layer(
-                        fit.surfaces["final"],
-                        scalars=np.abs(fit.model_to_scan_mm["final"]),
-                        colormap=SEQUENTIAL,
-                        vmax=top,
-                    )
-                ],
-            ),
+        _equal_views(
             fits,
             columns,
+            lambda fit: [distance_layer(fit.surfaces["final"], fit.model_to_scan_mm["final"], top, signed=False)],
         ),
         title=title,
         scale=_unsigned(fits, top),
@@ -632,14 +618,14 @@ def _grey(fits: Sequence[StagedFit]) -> list[tuple[str, Colour]]:
     return [(NOT_SHOWN, UNKNOWN_COLOUR)] if any(unknown(fit.model_to_scan_mm["final"]) for fit in fits) else []
 
 
-def _equal_views(fits: Sequence[StagedFit], columns: int, layers: Callable[[StagedFit], list[Layer]]) -> list[Image]:
-    """Return one view per fit, each from its own front, all of one size."""
+def _equal_views(fits: Sequence[StagedFit], columns: int, layers: Callable[[StagedFit], list[Layer]]) -> list[Row]:
+    """Return rows with one view per fit, each from its own front, all of one size, under its mean distance."""
     if not fits:
         raise InputError("There is nothing to draw without fits.")
     columns = min(columns, max(len(fits), 3))
     views = [view(fit.surfaces["final"].vertices, columns, margin=0.07) for fit in fits]
     size = (views[0].size[0], int(np.median([item.size[1] for item in views])))
-    return [
+    images = [
         render(
             *layers(fit),
             camera=Camera.framing(fit.surfaces["final"].vertices, aspect=size[0] / size[1], margin=0.07),
@@ -647,8 +633,4 @@ def _equal_views(fits: Sequence[StagedFit], columns: int, layers: Callable[[Stag
         )
         for fit in fits
     ]
-
-
-def _caption_rows(images: Sequence[Image], fits: Sequence[StagedFit], columns: int) -> list[Row]:
-    columns = min(columns, max(len(fits), 3))
-    return in_rows(images, [f"{short(f.label, 30)}\n{mm(mean_mm(f))}" for f in fits], columns)
+    return in_rows(images, [f"{short(f.label, 30)}\n{mm(mean_mm(f.model_to_scan_mm['final']))}" for f in fits], columns)

@@ -18,7 +18,7 @@ from shapespace.cohort.orientation import current_orientation, view_rotation
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.geometry.landmark_alignment import AlignedLandmarks
 from shapespace.geometry.thin_plate_spline import ThinPlateSpline
-from shapespace.report.analyses.shape_data import MOST_LANDMARKS
+from shapespace.report.analyses.analysis_report import MOST_LANDMARKS
 from shapespace.report.figures.analysis_figures import upright_views
 from shapespace.report.figures.draw import (
     BACKWARD,
@@ -27,6 +27,7 @@ from shapespace.report.figures.draw import (
     GREY,
     INK,
     LAYOUT,
+    MARKERS,
     RULE,
     SMALL,
     TEXT,
@@ -42,7 +43,7 @@ from shapespace.report.figures.draw import (
     type_size,
     view,
 )
-from shapespace.report.inputs.staged_fit import nice_ceiling
+from shapespace.report.inputs.saved_fits import nice_ceiling
 from shapespace.report.render.palette import CATEGORIES, DIVERGING, SEQUENTIAL, UNKNOWN_COLOUR
 from shapespace.report.render.renderer import Layer, render
 from shapespace.schemas import MorphospacePart
@@ -253,7 +254,6 @@ def draw_links(axes: Axes, points: FloatArray, colour: str, width: float = 1.6) 
     axes.add_collection(LineCollection(list(points[links]), colors=colour, linewidths=width, zorder=2))
 
 
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")  # in the order of those of widget-morphospace-drawing.js
 _FEWEST_OF_ELLIPSE = 5  # shapes; the radius of fewer is larger than the plot
 _ELLIPSE = 0.95  # probability
 _SPARSE = 5  # every fifth point of a grid line is kept, so that the page is small

@@ -39,7 +39,7 @@ from shapespace.report.figures.draw import (
     type_size,
     view,
 )
-from shapespace.report.inputs.staged_fit import nice_ceiling
+from shapespace.report.inputs.saved_fits import nice_ceiling
 from shapespace.report.render.palette import SEQUENTIAL
 from shapespace.report.render.renderer import Image, Layer, render
 from shapespace.schemas import BySize, Measured, Quality, read

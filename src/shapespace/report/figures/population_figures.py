@@ -24,6 +24,7 @@ from shapespace.report.figures.draw import (
     GREY,
     INK,
     LAYOUT,
+    MARKERS,
     SMALL,
     WIDTH,
     chart,
@@ -285,7 +286,6 @@ def levels_figure(groups: Sequence[tuple[str, Any]], values: FloatArray, *, word
     return finish(figure)
 
 
-_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 _MOST_IN_LEGEND = 16  # layout: entries
 _MOST_DOTS_BIG = 60  # layout: dots drawn at full size
 _LEGEND_LINE = 1.1
@@ -533,7 +533,7 @@ def _groups(scans: Sequence[Coefficients]) -> list[tuple[str, dict[str, Any], li
             name,
             {
                 "color": CATEGORIES[k % len(CATEGORIES)] if name or len(names) > 1 else MODEL_COLOUR,
-                "marker": _MARKERS[(k + k // len(CATEGORIES)) % len(_MARKERS)],
+                "marker": MARKERS[(k + k // len(CATEGORIES)) % len(MARKERS)],
             },
             [i for i, scan in enumerate(scans) if scan.expression == name],
         )

@@ -23,11 +23,9 @@ from shapespace.geometry.normals import (
     without_vertices,
 )
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.io.files import read_error, sha256_of_file
-from shapespace.io.meshes.mesh_io import read_mesh
+from shapespace.io.files import read_error
 from shapespace.report.blocks.wording import known, printable, sentence, without_folders
-from shapespace.report.inputs.saved_fits import Folder
-from shapespace.report.inputs.staged_fit import nice_ceiling
+from shapespace.report.inputs.saved_fits import Folder, ScanNotFoundError, nice_ceiling, unchanged_scan
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, read
 from shapespace.store.corresponding import describe_review
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity, are_same_triangles
@@ -186,19 +184,12 @@ class Corresponded:
         """Return the scan of a record, reflected if it is mirrored, if it is in the same place with the same content.
 
         Raises:
-            FileFormatError: it is not, or cannot be read.
+            ScanNotFoundError: it is not, or cannot be read.
         """
-        if not record.path or "\0" in record.path:
-            raise FileFormatError("the record does not say where the scan is.")
-        file = self.root / record.path
-        if not record.hash:
-            raise FileFormatError("the scan cannot be read.")
-        if not file.is_file() or sha256_of_file(file) != record.hash:
-            raise FileFormatError("the scan is no longer where it was, or has changed.")
-        try:
-            return mirror_image(read_mesh(file)) if record.mirrored else read_mesh(file)
-        except ShapespaceError as error:
-            raise FileFormatError("the scan cannot be read.") from error
+        if record.path and not record.hash:
+            raise ScanNotFoundError("the scan cannot be read.")
+        scan = unchanged_scan(self.root, record.path, record.hash)
+        return mirror_image(scan) if record.mirrored else scan
 
     def turn_upright(self) -> None:
         """Bring the mean shape upright, by the poses of some of the surfaces."""

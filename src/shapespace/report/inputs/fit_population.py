@@ -231,11 +231,8 @@ class Population:
             for k in rows[np.argsort(np.where(np.isfinite(error), -error, 0.0), kind="stable")[:max_count]]
         ]
 
-    def compared(self, column: ListedColumn) -> list[Group]:
-        """Return how the fits of each level, or stretch, of a column differ from all."""
-        return list(self._compared(column))
-
-    def _compared(self, column: ListedColumn) -> Iterator[Group]:
+    def compared(self, column: ListedColumn) -> Iterator[Group]:
+        """Yield how the fits of each level, or stretch, of a column differ from all."""
         trusted, errors = self.trusted, self.measures["expected_error_mm"]
         known = errors[trusted & np.isfinite(errors)]
         middle = float(np.median(known)) if len(known) else np.nan

@@ -1,4 +1,7 @@
-"""Reader of saved fits and the demo for reports: JSON, arrays, meshes and models, checked, inside one folder."""
+"""Reader of saved fits and the demo for reports: JSON, arrays, meshes and models, checked, inside one folder.
+
+`StagedFit` is a fit in the frame of the pictures: scan and model in mm, iteration by iteration, with signed distances.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ import shlex
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, cast
 
@@ -18,16 +22,20 @@ from msgspec import structs
 from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.fit.diagnostics.reasons import text_of
 from shapespace.fit.fit_scan import FitConfig
+from shapespace.fit.iteration_state import REGIONS, SHOWN
+from shapespace.fit.result import STAGES, FitResult
+from shapespace.fit.stages import STAGES_VERSION, stage_arrays
+from shapespace.geometry.closest import build_engine, on_boundary, surface_distances
 from shapespace.geometry.doctor import repair
+from shapespace.geometry.normals import boundary_vertices
 from shapespace.io.files import read_bytes, sha256_of_file
 from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.io.tables.table_io import table_rows
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report.blocks.wording import counted, known, printable
-from shapespace.report.inputs.staged_fit import StagedFit
 from shapespace.schemas import FitEntry, FitRecord
 from shapespace.store.results import ENDING, ENDINGS, Results, arrays_at, json_at, mesh_at, results_at
-from shapespace.types import FloatArray, Mesh
+from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 
 _AGAIN = "make it again with shapespace fit --stages"
 _FEWEST_POINTS = 20  # fewer are not a scan
@@ -300,19 +308,26 @@ def raw_scan(folder: Folder, fit: SavedFit) -> Mesh:
         FileError: it cannot be read.
         ScanNotFoundError: it is not, or is no scan.
     """
-    source = fit.record.scan
-    if not source.path or "\0" in source.path:
-        raise ScanNotFoundError("the record does not say where the scan is.")
-    file = folder.root / source.path
-    if not file.is_file() or sha256_of_file(file) != source.hash:
-        raise ScanNotFoundError("the scan is no longer where it was, or has changed.")
-    try:
-        mesh = read_mesh(file)
-    except ShapespaceError as error:
-        raise ScanNotFoundError("the scan cannot be read.") from error
+    mesh = unchanged_scan(folder.root, fit.record.scan.path, fit.record.scan.hash)
     if len(mesh.vertices) < _FEWEST_POINTS:
         raise ScanNotFoundError(f"the scan has {counted(len(mesh.vertices), 'point')}.")
     return mesh
+
+
+def unchanged_scan(root: Path, path: str, sha256: str) -> Mesh:
+    """Return a scan from its file, if the file is still at `path`, relative to `root`, with the same content.
+
+    Raises:
+        ScanNotFoundError: it is not, or cannot be read.
+    """
+    if not path or "\0" in path:
+        raise ScanNotFoundError("the record does not say where the scan is.")
+    if not (root / path).is_file() or sha256_of_file(root / path) != sha256:
+        raise ScanNotFoundError("the scan is no longer where it was, or has changed.")
+    try:
+        return read_mesh(root / path)
+    except ShapespaceError as error:
+        raise ScanNotFoundError("the scan cannot be read.") from error
 
 
 def model_of(folder: Folder, fits: Sequence[SavedFit], model_path: Path | None = None) -> ShapeModel:
@@ -400,3 +415,248 @@ def _listed(file: Path) -> set[str]:
         return {row[column] for row in rows}
     except (ShapespaceError, ValueError):
         return set()
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """One iteration of a fit.
+
+    Args:
+        phase: 1 or 2.
+        iteration: from 0, by phase.
+        rms_mm: RMS closest distance, mm of the scan.
+        b: (K,) coefficients then, mm of the model's frame.
+        T_final_now: from the model's frame then to the picture frame, see `stage_arrays`.
+    """
+
+    phase: int
+    iteration: int
+    rms_mm: float
+    b: FloatArray
+    T_final_now: Similarity
+
+    def vertices(self, model: ShapeModel) -> FloatArray:
+        """Return the model's surface then, (V, 3), in the picture frame."""
+        return self.T_final_now.apply(model.reconstruct(self.b))
+
+
+@dataclass(frozen=True, eq=False)
+class StagedFit:
+    """A fit in the picture frame: the axes of the model's frame, and the size of the scan in mm.
+
+    Args:
+        name: of the fit.
+        label: what pictures call it.
+        status: `converged`, `max_iterations` or `doubtful`.
+        reason: one sentence on why.
+        scan: the raw surface or points, as repaired.
+        surfaces: the model at each stage: `final`; `before` and `initial` where the stages were saved; `dense` where
+            there was one.
+        model_to_scan_mm: by stage, (V,) signed closest distances: positive where the scan lies outside of the model;
+            not-a-number at vertices that the scan does not show, as in `OverlapDistances`.
+        scan_to_model_mm: by stage, (S,) the same of scan points; not-a-number beyond the model's rim.
+        regions: (V,) codes of `fit.regions.REGIONS`; None where the stages were not saved.
+        b: (K,) mm.
+        z: (K,) in standard deviations of the model.
+        b_stddev: (K,) mm.
+        shrinkage: (K,) in [0, 1].
+        history: the iterations, in order; empty where the stages were not saved.
+    """
+
+    name: str
+    label: str
+    status: str
+    reason: str
+    scan: Mesh
+    surfaces: Mapping[str, Mesh]
+    model_to_scan_mm: Mapping[str, FloatArray]
+    scan_to_model_mm: Mapping[str, FloatArray]
+    regions: IntArray | None
+    b: FloatArray
+    z: FloatArray
+    b_stddev: FloatArray
+    shrinkage: FloatArray
+    history: tuple[Moment, ...]
+
+    @cached_property
+    def scale_mm(self) -> float:
+        """Where the colour scale of the signed distances ends, in every picture of this fit."""
+        return scale_end(np.concatenate([self.model_to_scan_mm["final"], self.scan_to_model_mm["final"]]))
+
+    @property
+    def region_shares(self) -> dict[str, float]:
+        """Share of the vertices in each of `REGIONS`; empty where the stages were not saved."""
+        if self.regions is None:
+            return {}
+        shares = np.bincount(self.regions, minlength=len(REGIONS)) / max(len(self.regions), 1)
+        return dict(zip(REGIONS, shares.tolist(), strict=True))
+
+    @staticmethod
+    def of(model: ShapeModel, result: FitResult, label: str = "") -> StagedFit:
+        """Return the staged fit of `result`, which was fitted by `model`."""
+        return StagedFit.from_arrays(
+            stage_arrays(result, model), result, name=result.scan_name, label=label or result.scan_name
+        )
+
+    @staticmethod
+    def from_surfaces(
+        surfaces: Mapping[str, Mesh], scan: Mesh, record: FitRecord, *, name: str, label: str
+    ) -> StagedFit:
+        """Return a fit from its saved surfaces and its scan, and measure its distances.
+
+        A vertex counts as not shown by the scan where its closest point lies on the border of the scan; nowhere if the
+        record states that the scan shows the complete model.
+
+        Args:
+            surfaces: `final`, and `dense` where there is one, in the picture frame.
+            scan: as repaired, in the picture frame.
+            record: of the fit.
+            name: of the fit.
+            label: what pictures call it.
+
+        Raises:
+            FileFormatError: the numbers of the record do not fit together.
+        """
+        known = _numbers_of(record)
+        if len({values.shape for values in known.values()}) > 1:
+            raise FileFormatError(f"{name}: the coefficients of its record do not fit together; fit the scan again.")
+        engine = build_engine(scan)
+        is_complete = record.shown is not None and record.shown.model_seen_share == 1.0
+        forward: dict[str, FloatArray] = {}
+        backward: dict[str, FloatArray] = {}
+        for stage, surface in surfaces.items():
+            distances = surface_distances(surface, scan, scan_engine=engine)
+            unseen = np.zeros(len(surface.vertices), dtype=bool)
+            if scan.faces is not None and surface.faces is not None and not is_complete:
+                unseen = on_boundary(engine.query(surface.vertices), scan, boundary_vertices(scan))
+            forward[stage] = np.where(unseen, np.nan, distances.model_to_scan_signed_mm)
+            backward[stage] = distances.scan_to_model_signed_mm
+        return StagedFit(
+            name=name,
+            label=label,
+            status=record.status,
+            reason=record.reason,
+            scan=scan,
+            surfaces=surfaces,
+            model_to_scan_mm=forward,
+            scan_to_model_mm=backward,
+            regions=None,
+            **known,
+            history=(),
+        )
+
+    @staticmethod
+    @np.errstate(all="ignore")  # what overflows, or is divided by zero, is refused at the end
+    def from_arrays(
+        arrays: Mapping[str, npt.NDArray[Any]], record: FitResult | FitRecord, *, name: str, label: str
+    ) -> StagedFit:
+        """Return a fit from the arrays of NAME.stages.npz.
+
+        Args:
+            arrays: of the file.
+            record: its result, or its record: status, reason and numbers.
+            name: of the fit.
+            label: what pictures call it.
+
+        Raises:
+            FileFormatError: arrays are absent, of an earlier version, or do not fit together.
+        """
+        remedy = "fit the scan again with --stages"
+        known = _numbers_of(record)
+        if not np.array_equal(arrays.get("format_version", 0), STAGES_VERSION):
+            raise FileFormatError(f"{name}: its stages were saved by another version of shapespace; {remedy}.")
+        try:
+            faces = arrays.get("faces")
+            scan = Mesh(
+                arrays["scan"].astype(np.float64), arrays.get("scan_faces"), name=name,
+                colours=arrays.get("scan_colours"),
+            )  # fmt: skip
+            surfaces: dict[str, Mesh] = {}
+            forward: dict[str, FloatArray] = {}
+            backward: dict[str, FloatArray] = {}
+            for stage in (*STAGES, *(("dense",) if "dense" in arrays else ())):
+                surfaces[stage] = Mesh(
+                    arrays[stage].astype(np.float64), faces, name=name, colours=arrays.get(f"colours_{stage}")
+                )
+                forward[stage] = arrays[f"model_to_scan_{stage}"].astype(np.float64)
+                backward[stage] = arrays[f"scan_to_model_{stage}"].astype(np.float64)
+            regions = np.clip(arrays["regions"], 0, len(REGIONS)).astype(np.int32)
+            history = tuple(
+                Moment(int(phase), int(iteration), float(rms), np.asarray(b_now, dtype=np.float64), _similarity(T))
+                for phase, iteration, rms, b_now, T in zip(
+                    *(arrays[f"history_{key}"] for key in ("phase", "iteration", "rms_mm", "b", "T")), strict=True
+                )
+            )
+        except (KeyError, ValueError, TypeError, IndexError, OverflowError, ShapespaceError) as error:
+            raise FileFormatError(f"{name}: its saved stages are damaged ({error}); {remedy}.") from error
+        V, S = len(surfaces["final"].vertices), len(scan.vertices)
+        checks = (
+            all(np.isfinite(mesh.vertices).all() for mesh in (scan, *surfaces.values())),
+            all(len(surface.vertices) == V for surface in surfaces.values()),
+            all(d.shape == (V,) and np.isfinite(d).all() for d in forward.values()),
+            all(d.shape == (S,) and not np.isinf(d).any() for d in backward.values()),
+            regions.shape == (V,) and int(regions.max(initial=0)) < len(REGIONS),
+            len({values.shape for values in (*known.values(), *(moment.b for moment in history))}) == 1,
+            all(np.isfinite(moment.b).all() for moment in history),
+        )
+        if not all(checks):
+            raise FileFormatError(f"{name}: its saved stages do not fit together; {remedy}.")
+        return StagedFit(
+            name=name,
+            label=label,
+            status=record.status,
+            reason=record.reason,
+            scan=scan,
+            surfaces=surfaces,
+            model_to_scan_mm={stage: np.where(np.isin(regions, SHOWN), d, np.nan) for stage, d in forward.items()},
+            scan_to_model_mm=backward,
+            regions=regions,
+            **known,
+            history=history,
+        )
+
+
+def _numbers_of(record: FitResult | FitRecord) -> dict[str, FloatArray]:
+    """Return the coefficients of a fit by the names of their fields."""
+    names = ("b", "z", "b_stddev", "shrinkage")
+    return {name: np.array(getattr(record, name), dtype=np.float64) for name in names}
+
+
+def measured_mm(distances_mm: FloatArray) -> FloatArray:
+    """Return the absolute values of the finite signed distances, (n,)."""
+    return np.abs(distances_mm[np.isfinite(distances_mm)])
+
+
+def mean_mm(distances_mm: FloatArray) -> float:
+    """Return the mean of the absolute values of the finite signed distances; NaN for none."""
+    known = measured_mm(distances_mm)
+    return float(known.mean()) if len(known) else math.nan
+
+
+_MEDIANS = 5.0
+"""Of the distances, at which a scale ends at the latest; beyond it lies what is no part of the object."""
+
+
+def scale_end(distances_mm: FloatArray) -> float:
+    """Return the end of a colour scale for signed distances (N,), mm, robust against outliers."""
+    known = measured_mm(distances_mm)
+    if not len(known):
+        return 1.0
+    return nice_ceiling(min(float(np.percentile(known, 97)), _MEDIANS * float(np.median(known))))
+
+
+def nice_ceiling(value: float) -> float:
+    """Return a round number at or a little above `value`, 1 where that is not positive."""
+    if not (value > 0 and np.isfinite(value)):
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(value))
+    steps = np.array([1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10])
+    return float(power * steps[np.searchsorted(steps, value / power - 1e-9)])
+
+
+def _similarity(T: npt.NDArray[Any]) -> Similarity:
+    matrix = np.asarray(T, dtype=np.float64)
+    if not np.isfinite(matrix).all():
+        raise ValueError("a pose that is not finite")
+    scale = float(np.cbrt(np.linalg.det(matrix[:, :3])))
+    return Similarity(scale, matrix[:, :3] / scale, matrix[:, 3])

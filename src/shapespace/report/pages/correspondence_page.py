@@ -56,8 +56,7 @@ from shapespace.report.inputs.correspondence_folder import (
     scan_status,
     upright,
 )
-from shapespace.report.inputs.saved_fits import Folder
-from shapespace.report.inputs.staged_fit import nice_ceiling
+from shapespace.report.inputs.saved_fits import Folder, nice_ceiling
 from shapespace.report.pages.page import Chapter, Page
 from shapespace.report.render import thumbnails
 from shapespace.report.render.palette import DIVERGING, SEQUENTIAL

@@ -14,8 +14,7 @@ from shapespace.report import figures
 from shapespace.report.blocks import sections
 from shapespace.report.blocks.blocks import Block, Facts, Figure, Folded, Notice, Table, Text, Tiles, text_table
 from shapespace.report.blocks.wording import DASH, STATUS_WORDS, isfinite, mm, moment, plain, setting, words
-from shapespace.report.inputs.saved_fits import Folder, SavedFit, read_fit, staged_fit
-from shapespace.report.inputs.staged_fit import StagedFit
+from shapespace.report.inputs.saved_fits import Folder, SavedFit, StagedFit, read_fit, staged_fit
 from shapespace.report.pages.page import Chapter, Make, Page
 from shapespace.schemas import DEMO_AGAIN, Case, Demo, DemoModel, ExpressionsOfOne, FitEntry, read
 

@@ -58,14 +58,15 @@ from shapespace.report.inputs.saved_fits import (
     Folder,
     SavedFit,
     ScanNotFoundError,
+    StagedFit,
     command_with_stages,
     model_of,
+    nice_ceiling,
     raw_scan,
     saved_fit,
     saved_surfaces,
     staged_fit,
 )
-from shapespace.report.inputs.staged_fit import StagedFit, nice_ceiling
 from shapespace.report.pages import study_page
 from shapespace.report.pages.page import Chapter, Page
 from shapespace.report.render import thumbnails

@@ -15,7 +15,7 @@ from msgspec import structs
 
 from shapespace.errors import FileFormatError
 from shapespace.report import figures
-from shapespace.report.analyses.shape_data import MOST_LANDMARKS
+from shapespace.report.analyses.analysis_report import MOST_LANDMARKS
 from shapespace.report.blocks import sections
 from shapespace.report.blocks.blocks import (
     Block,

@@ -40,7 +40,7 @@ REGION_COLOURS: Mapping[str, Colour] = MappingProxyType(
         "unseen": (0.80, 0.80, 0.80),
     }
 )
-"""What the fit made of each part of the model, by the names of `shapespace.report.inputs.staged_fit.REGIONS`."""
+"""What the fit made of each part of the model, by the names of `shapespace.report.inputs.saved_fits.REGIONS`."""
 
 # Okabe and Ito's colours, with a dark red in place of the yellow that white paper swallows.
 CATEGORIES: tuple[Colour, ...] = (
@@ -100,11 +100,6 @@ def _between(positions: npt.NDArray[Any], known: npt.NDArray[Any], colours: Floa
     return np.stack([np.interp(positions, known, colours[:, k]) for k in range(3)], axis=1)
 
 
-def _sequential() -> FloatArray:
-    anchors = ("f6f1e4", "f3cf8e", "e98f53", "c24a5c", "7a2669", "2b1250")
-    return read_only(_even(oklab([_hex(name) for name in anchors]), 256))
-
-
 def _diverging() -> FloatArray:
     middle, cold, warm = (
         oklab([_hex(name) for name in names])
@@ -120,7 +115,8 @@ def _hex(text: str) -> list[float]:
     return [int(text[k : k + 2], 16) / 255 for k in (0, 2, 4)]
 
 
-SEQUENTIAL = _sequential()
+_PALE_TO_DARK = ("f6f1e4", "f3cf8e", "e98f53", "c24a5c", "7a2669", "2b1250")
+SEQUENTIAL = read_only(_even(oklab([_hex(name) for name in _PALE_TO_DARK]), 256))
 """(256, 3) float64, sRGB in [0, 1]: pale for small, dark for large."""
 DIVERGING = _diverging()
 """(256, 3) float64, sRGB in [0, 1]: blue for negative, pale for zero, red for positive."""

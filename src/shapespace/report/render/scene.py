@@ -23,7 +23,7 @@ import numpy.typing as npt
 from shapespace.cohort.orientation import current_orientation
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.remesh import collapse
-from shapespace.report.inputs.staged_fit import StagedFit, measured_mm
+from shapespace.report.inputs.saved_fits import StagedFit, mean_mm, measured_mm
 from shapespace.report.render import palette as colours
 from shapespace.schemas import FitRecord, to_json
 from shapespace.types import FloatArray, IntArray, Mesh
@@ -325,10 +325,10 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: i
         # Points have no inside.
         "signed": staged.scan.faces is not None,
         "mean_mm": {
-            stage: {"model": _mean(staged.model_to_scan_mm[stage]), "scan": _mean(staged.scan_to_model_mm[stage])}
+            stage: {"model": mean_mm(staged.model_to_scan_mm[stage]), "scan": mean_mm(staged.scan_to_model_mm[stage])}
             for stage in staged.surfaces
         },
-        "region_shares": _region_shares(staged),
+        "region_shares": list(staged.region_shares.values()),
         "scan_vertices": len(staged.scan.vertices),
         "scan_faces": 0 if staged.scan.faces is None else len(staged.scan.faces),
         "thinned": len(scan.vertices) < len(staged.scan.vertices) or len(model.vertices) < len(last.vertices),
@@ -547,17 +547,6 @@ def _neighbours_together(faces: IntArray, vertices: int) -> tuple[npt.NDArray[np
     new_faces = rank[faces]
     new_faces = np.take_along_axis(new_faces, (new_faces.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
     return order, new_faces[np.lexsort((new_faces[:, 2], new_faces[:, 1], new_faces[:, 0]))]
-
-
-def _region_shares(staged: StagedFit) -> list[float]:
-    """Return the share of each region of `fit.regions.REGIONS`; empty where the regions were not saved."""
-    regions = staged.regions
-    return [] if regions is None else (np.bincount(regions, minlength=4) / max(len(regions), 1)).tolist()
-
-
-def _mean(signed_mm: FloatArray) -> float:
-    known_mm = measured_mm(signed_mm)
-    return float(known_mm.mean()) if len(known_mm) else math.nan
 
 
 def _shares_beyond(signed_mm: FloatArray) -> npt.NDArray[Any]:

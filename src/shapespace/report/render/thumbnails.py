@@ -13,7 +13,7 @@ from shapespace.errors import InputError
 from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.normals import faces_of
 from shapespace.report.inputs.correspondence_folder import drawable, observed_mask
-from shapespace.report.inputs.staged_fit import StagedFit
+from shapespace.report.inputs.saved_fits import StagedFit
 from shapespace.report.render.palette import CATEGORIES, DIVERGING, MODEL_COLOUR, SCAN_COLOUR, SEQUENTIAL, Colour
 from shapespace.report.render.renderer import (
     SQUARE_COLOURS,

@@ -1,17 +1,31 @@
-"""Report of a test of shape: the same for all of them, from the table of tests."""
+"""The report of a test of shape, the same for all of them, and report and files of the result of any analysis."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from functools import singledispatch
+from pathlib import Path
 
 import numpy as np
 
-from shapespace.report.analyses.analysis_report import AnalysisReport, Column, Table, histogram_part
+from shapespace.report.analyses.analysis_report import (
+    AnalysisReport,
+    Column,
+    ResultTable,
+    cohort_report,
+    histogram_part,
+)
+from shapespace.report.analyses.asymmetry_report import asymmetry_report
+from shapespace.report.analyses.change_report import change_report
+from shapespace.report.analyses.compare_report import compare_report
+from shapespace.report.analyses.identity_report import identify_report, verify_report
 from shapespace.report.analyses.methods_section import points_word
-from shapespace.report.analyses.shape_data import cohort_report
+from shapespace.report.analyses.regression_report import regression_report, shape_prediction_report
+from shapespace.report.analyses.score_report import score_report
 from shapespace.schemas import HistogramPart
 from shapespace.statistics.effect_size import permutation_p
+from shapespace.statistics.methods import AnalysisResult
 from shapespace.statistics.shape_tests.shape_test_result import ShapeTestResult, Statistic
 from shapespace.statistics.tolerances import TIE
 from shapespace.types import FloatArray
@@ -30,7 +44,7 @@ def shape_test_report(result: ShapeTestResult) -> AnalysisReport:
     """Return the report of a test of shape."""
     summary = result.test.summary
     files = [
-        Table.of_fields(
+        ResultTable.of_fields(
             f"{re.sub(r'[^a-z0-9]+', '_', (one.title or 'table').lower()).strip('_')}.csv",
             [own.name for own in one.columns],
             one.rows,
@@ -92,11 +106,11 @@ def _least_p(arrangements: FloatArray) -> float:
     return min(float((np.abs(arrangements - end) <= TIE * abs(end)).mean()) for end in ends)
 
 
-def _statistics_table(result: ShapeTestResult) -> Table:
+def _statistics_table(result: ShapeTestResult) -> ResultTable:
     note = f"{result.test.statistics[:1].upper()}{result.test.statistics[1:]}."
     unknown = dict.fromkeys(one.name for one in result.statistics if one.unknown_p)
     note += f" p of {', '.join(unknown)} is not known where it is blank." if unknown else ""
-    return Table(
+    return ResultTable(
         title="Statistics",
         columns=(
             Column("statistic", field="statistic"), Column("tested", field="tested"),
@@ -118,3 +132,29 @@ def _histograms(result: ShapeTestResult) -> Iterator[HistogramPart]:
             f"{one.label} among its permutations", {"permutations": one.arrangements[np.isfinite(one.arrangements)]},
             _BINS, x=one.name, observed=one.value, observed_label="observed",
         )  # fmt: skip
+
+
+@singledispatch
+def analysis_report(result: AnalysisResult) -> AnalysisReport:
+    """Return the report of the result of an analysis.
+
+    Raises:
+        TypeError: a result without a report.
+    """
+    raise TypeError(f"{type(result).__name__} is not the result of an analysis with a report.")
+
+
+for _report in (
+    asymmetry_report, change_report, compare_report, identify_report, regression_report, score_report,
+    shape_prediction_report, shape_test_report, verify_report,
+):  # fmt: skip
+    analysis_report.register(_report)  # by the type of its first argument
+
+
+def save_analysis(result: AnalysisResult, folder: Path | str) -> Path:
+    """Write the report, tables, arrays and meshes of a result to a folder, and return the path of analysis.json.
+
+    Raises:
+        FileError: the folder cannot be written, or the disk is full.
+    """
+    return analysis_report(result).save(folder)
