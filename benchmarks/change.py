@@ -39,10 +39,9 @@ from shapespace.cohort.read import CohortConfig, read_cohort
 from shapespace.datasets.faces import load_faces
 from shapespace.datasets.organs import Organ, raw_surface
 from shapespace.datasets.simulated_scan import Hole, random_similarity, simulate_scan
-from shapespace.geometry.normals import vertex_normals
+from shapespace.geometry.normals import enclosed_volume, vertex_normals
 from shapespace.io.landmarks.landmark_io import write_landmark_indices
 from shapespace.io.meshes.mesh_io import write_mesh
-from shapespace.statistics.change_maps import volume_mm3
 from shapespace.statistics.change_result import ChangeConfig
 from shapespace.statistics.measure_change import ChangeResult, change
 from shapespace.types import FloatArray, Mesh
@@ -196,7 +195,7 @@ def grown(organ: Organ, share: float) -> Organ:
 def volume(mesh: Mesh) -> float:
     """Return the volume of a closed surface, mm3."""
     assert mesh.faces is not None
-    return volume_mm3(mesh.vertices, mesh.faces)
+    return enclosed_volume(mesh.vertices, mesh.faces)
 
 
 def organ_plan(plan: Plan) -> dict[str, list[float]]:
