@@ -33,8 +33,8 @@ from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.correspondence.template import choose_template, clean_scan, resample
 from shapespace.datasets.simulated_scan import random_similarity
 from shapespace.geometry.closest import build_engine
-from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.doctor import repair
+from shapespace.geometry.normals import Distortion
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.model.model_quality import Curve, ModelQuality, QualityConfig, measure_quality

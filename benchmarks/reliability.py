@@ -38,7 +38,7 @@ from shapespace.datasets.ict import EXPRESSIONS, load_ict
 from shapespace.datasets.simulated_scan import simulate_scan
 from shapespace.errors import ShapespaceError
 from shapespace.fit.diagnostics import failure_model
-from shapespace.fit.diagnostics.evidence import FitEvidence
+from shapespace.fit.diagnostics.failure_model import FitEvidence
 from shapespace.geometry.normals import face_areas, rms_size
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh, Similarity

@@ -33,8 +33,7 @@ from shapespace import FitConfig, fit_scan
 from shapespace.datasets.ict import EXPRESSIONS
 from shapespace.datasets.simulated_scan import Collar, Hair, retriangulate, simulate_scan
 from shapespace.errors import ShapespaceError
-from shapespace.fit.diagnostics.evidence import FitEvidence
-from shapespace.fit.diagnostics.failure_model import SCORE_TERMS
+from shapespace.fit.diagnostics.failure_model import SCORE_TERMS, FitEvidence
 from shapespace.geometry.normals import face_areas
 from shapespace.types import MM_PER_UNIT, FloatArray, Mesh, Similarity
 

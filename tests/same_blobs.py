@@ -7,8 +7,7 @@ import numpy as np
 from msgspec import structs
 
 from shapespace.correspondence.scan_status import SurfaceMeasures, find_review_reasons
-from shapespace.geometry.distortion import Distortion
-from shapespace.geometry.normals import rms_size
+from shapespace.geometry.normals import Distortion, rms_size
 from shapespace.io.files import make_folder, sha256_of_file, write_text
 from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.schemas import CorrespondenceRecord, CorrespondRecord, json_text

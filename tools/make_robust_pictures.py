@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from shapespace.datasets.faces import load_faces
 from shapespace.datasets.simulated_scan import Cut, Hole, simulate_scan
-from shapespace.fit.robust.normal_equations import Estimate
+from shapespace.fit.robust.posterior import Estimate
 from shapespace.fit.robust.prepared_model import prepare
 from shapespace.fit.robust.robust_icp import Iterate, Problem
 from shapespace.fit.robust.robust_settings import RobustSettings

@@ -34,8 +34,7 @@ if TYPE_CHECKING:
     from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
     from shapespace.model.build_model import BuildConfig, build_model
     from shapespace.model.shape_model import ShapeModel
-    from shapespace.recognise.predict import train_classifier
-    from shapespace.recognise.shape_space import ShapeSpace
+    from shapespace.recognise.predict import ShapeSpace, train_classifier
     from shapespace.types import Mesh
 
 __all__ = [
@@ -86,8 +85,7 @@ _name, __dir__ = lazy_names(
         "io.meshes.mesh_io": ("read_mesh", "write_mesh"),
         "model.build_model": ("BuildConfig", "build_model"),
         "model.shape_model": ("ShapeModel",),
-        "recognise.predict": ("train_classifier",),
-        "recognise.shape_space": ("ShapeSpace",),
+        "recognise.predict": ("ShapeSpace", "train_classifier"),
         "types": ("Mesh",),
     },
 )

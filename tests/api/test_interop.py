@@ -261,7 +261,7 @@ def test_a_fitted_pipeline_is_kept_by_skops_and_names_what_it_trusts(
     meshes, y, _ = labelled
     pipeline = Pipeline([("shape", ss.ShapeSpace(modes=3)), ("classify", LogisticRegression())]).fit(meshes, y)
     content = sio.dumps(pipeline)
-    ours = ["shapespace.model.shape_model.ShapeModel", "shapespace.recognise.shape_space.ShapeSpace"]
+    ours = ["shapespace.model.shape_model.ShapeModel", "shapespace.recognise.predict.ShapeSpace"]
     assert sorted(sio.get_untrusted_types(data=content)) == ours
     again = sio.loads(content, trusted=ours)
     np.testing.assert_array_equal(again.predict_proba(meshes), pipeline.predict_proba(meshes))

@@ -2,8 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from shapespace.cohort.labels import Label, read_labels
-from shapespace.cohort.table import names_of_file
+from shapespace.cohort.table import Label, names_of_file, read_labels
 from shapespace.errors import FileFormatError
 
 

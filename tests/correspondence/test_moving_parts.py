@@ -11,9 +11,8 @@ from shapespace.correspondence.isometry import IntrinsicShape, bent_shapes, comm
 from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.correspondence.template import resample
 from shapespace.errors import InputError
-from shapespace.geometry.distortion import edge_stretch
 from shapespace.geometry.mirror_plane import mirror_image
-from shapespace.geometry.normals import faces_of
+from shapespace.geometry.normals import edge_stretch, faces_of
 from shapespace.types import FloatArray, Mesh
 
 ARMS = np.array([[1.0, 0, 0], [-0.5, 0.7, 0.2], [-0.3, -0.8, 0.5], [0.1, 0.2, -1.0]])

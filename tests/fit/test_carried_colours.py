@@ -9,8 +9,7 @@ import numpy as np
 from shapespace.batch.fit_records import write_fitted_mesh
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.iteration_state import MATCHED
-from shapespace.fit.result import FitResult, carried_colours
-from shapespace.fit.stages import stage_arrays
+from shapespace.fit.result import FitResult, carried_colours, stage_arrays
 from shapespace.geometry.closest import build_engine
 from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.report.inputs.saved_fits import StagedFit

@@ -10,8 +10,7 @@ from scipy.spatial import ConvexHull
 from shapespace.datasets.simulated_scan import Cut, simulate_scan
 from shapespace.errors import FitError, InputError
 from shapespace.fit.completion.complete import Completion, CompletionConfig, complete, refine_surface
-from shapespace.fit.completion.leave_one_out import leave_one_out
-from shapespace.fit.completion.shape_posterior import _Data
+from shapespace.fit.completion.shape_posterior import _Data, leave_one_out
 from shapespace.fit.dense.residual_modes import ResidualModes
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.geometry.closest import build_engine

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from shapespace.datasets.simulated_scan import Cut, simulate_scan
-from shapespace.fit.diagnostics.evidence import FitEvidence
 from shapespace.fit.diagnostics.failure_model import (
     ERROR_TERMS,
     SCORE_TERMS,
+    FitEvidence,
     estimate_error,
     failure_score,
     find_failure_reasons,

@@ -9,9 +9,7 @@ import pytest
 from test_failure_model import GOOD
 
 from shapespace.datasets.simulated_scan import simulate_scan
-from shapespace.fit.diagnostics.evidence import FitEvidence
-from shapespace.fit.diagnostics.failure_model import with_mirror_image
-from shapespace.fit.diagnostics.odd_scans import chirality_of, find_odd_scan_reasons
+from shapespace.fit.diagnostics.failure_model import FitEvidence, chirality_of, find_odd_scan_reasons, with_mirror_image
 from shapespace.fit.diagnostics.reasons import Reason, ReasonCode, text_of
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.iteration_state import RobustFitted, last_of

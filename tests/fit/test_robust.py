@@ -11,7 +11,7 @@ from shapespace.errors import FitError, InputError
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.method_choices import method_named
 from shapespace.fit.robust.matching import Matcher, MatchHint, match_vertices
-from shapespace.fit.robust.normal_equations import Estimate, small_similarity
+from shapespace.fit.robust.posterior import Estimate, small_similarity
 from shapespace.fit.robust.prepared_model import LinearShape, ModelSurface, prepare
 from shapespace.fit.robust.robust_icp import Iterate, Problem, in_span
 from shapespace.fit.robust.robust_settings import Level, RobustSettings

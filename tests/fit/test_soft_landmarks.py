@@ -9,8 +9,7 @@ from shapespace.datasets.organs import Organ
 from shapespace.datasets.simulated_scan import SimulatedScan, random_similarity, simulate_scan
 from shapespace.errors import InputError
 from shapespace.fit.fit_scan import FitConfig, FitResult, fit_scan
-from shapespace.fit.landmark_terms import LandmarkConstraint
-from shapespace.fit.robust.prepared_model import LinearShape, prepare
+from shapespace.fit.robust.prepared_model import LandmarkConstraint, LinearShape, prepare
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh, SurfaceLandmarks
 from synthetic_shapes import blob_model, raw_scan, similarity, sphere

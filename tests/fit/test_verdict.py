@@ -9,8 +9,7 @@ from shapespace.errors import InputError
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.method_choices import METHODS
 from shapespace.fit.result import FitResult
-from shapespace.fit.robust.normal_equations import Estimate
-from shapespace.fit.robust.posterior import variance_of_new_shapes
+from shapespace.fit.robust.posterior import Estimate, variance_of_new_shapes
 from shapespace.fit.robust.prepared_model import prepare
 from shapespace.fit.robust.robust_icp import in_span
 from shapespace.geometry.closest import surface_distances

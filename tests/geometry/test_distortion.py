@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from shapespace.errors import MeshError
-from shapespace.geometry.distortion import Distortion
+from shapespace.geometry.normals import Distortion
 from shapespace.types import FloatArray, Mesh
 from synthetic_shapes import blob, similarity, sphere
 

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from shapespace.geometry.distortion import factor_to_draw, flip_factor
-from shapespace.geometry.normals import face_vectors
+from shapespace.geometry.normals import face_vectors, factor_to_draw, flip_factor
 from synthetic_shapes import training_meshes
 
 

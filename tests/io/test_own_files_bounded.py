@@ -16,7 +16,7 @@ import pytest
 
 from shapespace.batch.fit_records import read_record
 from shapespace.batch.result_folder import records_in
-from shapespace.cohort.labels import read_labels
+from shapespace.cohort.table import read_labels
 from shapespace.errors import FileError, FileFormatError
 from shapespace.io.containers.archives import kept_arrays, read_arrays
 from shapespace.io.containers.json_files import plain_json, read_json

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from shapespace.cohort.labels import Label, read_labels
-from shapespace.cohort.table import read_table
+from shapespace.cohort.table import Label, read_labels, read_table
 from shapespace.errors import FileFormatError
 from shapespace.io.tables.table_io import CHECKSUM, checked_table_text, table_rows, table_text
 from shapespace.io.tables.workbook import sheet_rows

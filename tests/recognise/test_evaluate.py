@@ -190,7 +190,7 @@ def test_the_fast_permutation_test_is_the_slow_one(monkeypatch):
     z[5] = np.nan
     folds = folds_of(z, labels, subjects, 4)
     fast = permutation_test(folds, "lda", permutations=20, seed=2)
-    monkeypatch.setattr("shapespace.recognise.resampling._score_lda", None)
+    monkeypatch.setattr("shapespace.recognise.evaluate._score_lda", None)
     monkeypatch.setitem(CLASSIFIERS, "the same", CLASSIFIERS["lda"])
     slow = permutation_test(folds, "the same", permutations=20, seed=2)
     assert fast.observed == pytest.approx(slow.observed)

@@ -5,8 +5,7 @@ import pytest
 
 from shapespace import schemas
 from shapespace.batch.fit_records import coefficient_row, failed_record, write_coefficients
-from shapespace.cohort.labels import Label, Labels
-from shapespace.cohort.table import Table
+from shapespace.cohort.table import Label, Labels, Table
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.recognise.classifiers import CLASSIFIERS
 from shapespace.recognise.labelled_scans import (

@@ -15,9 +15,8 @@ import numpy as np
 from msgspec import structs
 
 from shapespace.errors import FileFormatError
-from shapespace.fit.result import FitResult
+from shapespace.fit.result import FitResult, stage_arrays
 from shapespace.fit.result import OverlapDistances as FitOverlap
-from shapespace.fit.stages import stage_arrays
 from shapespace.geometry.closest import SurfaceDistances
 from shapespace.geometry.normals import face_areas, rms_size
 from shapespace.io.files import atomic_path, sha256_of_file, write_bytes, write_text

@@ -14,8 +14,7 @@ import numpy as np
 from shapespace.batch.fit_records import read_record
 from shapespace.batch.progress import progress, waiting
 from shapespace.batch.result_folder import RECORD
-from shapespace.cohort.labels import read_labels
-from shapespace.cohort.table import names_of_file
+from shapespace.cohort.table import names_of_file, read_labels
 from shapespace.commands.inputs import SurfacesOnDisk
 from shapespace.commands.look import model_facts, training_shapes_note
 from shapespace.commands.outcome import Outcome

@@ -13,8 +13,7 @@ from shapespace.batch.executors import ExecutionConfig
 from shapespace.batch.fit_records import read_record
 from shapespace.batch.progress import telling_of_compiling
 from shapespace.batch.result_folder import RECORD
-from shapespace.cohort.labels import read_labels
-from shapespace.cohort.table import notes_on_classes
+from shapespace.cohort.table import notes_on_classes, read_labels
 from shapespace.commands.outcome import Outcome, first_lines
 from shapespace.errors import InputError
 from shapespace.io.files import make_folder, read_bytes, read_error

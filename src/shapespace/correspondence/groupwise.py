@@ -49,10 +49,9 @@ from shapespace.correspondence.settings import FEWEST, SIZE, CorrespondConfig
 from shapespace.correspondence.template import PoseModel, clean_scan
 from shapespace.correspondence.vertex_confidence import VertexConfidence
 from shapespace.errors import InputError, ShapespaceError
-from shapespace.geometry.distortion import Distortion
 from shapespace.geometry.landmark_placement import place_landmarks
 from shapespace.geometry.mirror_plane import ASYMMETRIC, FLIP, Sides, mirror_image, solve_sides
-from shapespace.geometry.normals import face_areas, rms_size, without_estimates
+from shapespace.geometry.normals import Distortion, face_areas, rms_size, without_estimates
 from shapespace.geometry.procrustes import align_to_weighted_mean
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.interop import as_meshes

@@ -15,8 +15,7 @@ import numpy as np
 
 from shapespace.correspondence.harmonics import Harmonics
 from shapespace.correspondence.template import clean_scan, resample
-from shapespace.geometry.distortion import edge_stretch
-from shapespace.geometry.normals import face_vectors, faces_of, rms_size, vertex_normals
+from shapespace.geometry.normals import edge_stretch, face_vectors, faces_of, rms_size, vertex_normals
 from shapespace.types import FloatArray, IntArray, Mesh
 
 _VERTICES = 2000  # of the coarse mesh of a scan, and at most of the template's that are mapped: cost grows with them

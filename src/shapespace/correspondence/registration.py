@@ -29,9 +29,8 @@ from shapespace.fit.robust.robust_settings import DenseSettings
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.search.initialisation import Start
 from shapespace.geometry.closest import ClosestPoints, build_engine, on_boundary
-from shapespace.geometry.distortion import edge_stretch
 from shapespace.geometry.mirror_plane import mirror_image
-from shapespace.geometry.normals import boundary_edges, boundary_vertices, rms_size, vertex_normals
+from shapespace.geometry.normals import boundary_edges, boundary_vertices, edge_stretch, rms_size, vertex_normals
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, ByteArray, FloatArray, IntArray, Mesh, Similarity

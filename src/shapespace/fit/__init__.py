@@ -10,8 +10,7 @@ from shapespace.lazy import lazy_names
 
 if TYPE_CHECKING:
     from shapespace.fit.completion.complete import Completion, QuantityEstimate
-    from shapespace.fit.diagnostics.evidence import FitEvidence
-    from shapespace.fit.diagnostics.failure_model import ErrorEstimate
+    from shapespace.fit.diagnostics.failure_model import ErrorEstimate, FitEvidence
     from shapespace.fit.diagnostics.reasons import Reason, ReasonCode
     from shapespace.fit.fit_scan import FitConfig
     from shapespace.fit.paper.paper_method import Paper
@@ -38,8 +37,7 @@ __getattr__, __dir__ = lazy_names(
     __name__,
     {
         "fit.completion.complete": ("Completion", "QuantityEstimate"),
-        "fit.diagnostics.evidence": ("FitEvidence",),
-        "fit.diagnostics.failure_model": ("ErrorEstimate",),
+        "fit.diagnostics.failure_model": ("ErrorEstimate", "FitEvidence"),
         "fit.diagnostics.reasons": ("Reason", "ReasonCode"),
         "fit.fit_scan": ("FitConfig",),
         "fit.paper.paper_method": ("Paper",),

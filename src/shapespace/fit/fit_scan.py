@@ -15,16 +15,14 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from shapespace.errors import FitError, InputError
-from shapespace.fit.crop import Crop
 from shapespace.fit.diagnostics.verdict import judge
-from shapespace.fit.iteration_state import Fitted, IcpState
-from shapespace.fit.landmark_terms import SHARE, LandmarkConstraint
+from shapespace.fit.iteration_state import UNSEEN, Fitted, IcpState
 from shapespace.fit.method import Ended, Limits, Method
 from shapespace.fit.method_choices import method_named
-from shapespace.fit.region_fit import RegionFit
 from shapespace.fit.result import FitResult, Stage
+from shapespace.fit.robust.prepared_model import SHARE, LandmarkConstraint
 from shapespace.fit.robust.robust_settings import DenseSettings
-from shapespace.fit.scan_target import ScanTarget, mm_frame
+from shapespace.fit.scan_target import Crop, ScanTarget, mm_frame
 from shapespace.fit.search.initialisation import (
     Start,
     find_unit,
@@ -38,12 +36,87 @@ from shapespace.geometry.landmark_placement import landmarks_in_frame_of
 from shapespace.geometry.normals import rms_size
 from shapespace.io.interop import MeshLike, as_mesh
 from shapespace.io.landmarks.landmark_io import read_landmarks
+from shapespace.model.region import Part
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import MM_PER_UNIT, BoolArray, FloatArray, Mesh, Similarity
+from shapespace.types import MM_PER_UNIT, BoolArray, FloatArray, IntArray, Mesh, Similarity, SurfaceLandmarks
 from shapespace.version import __version__
 
 if TYPE_CHECKING:
     from shapespace.model.additive import AdditiveModel
+
+
+@dataclass(frozen=True, eq=False)
+class RegionFit:
+    """What turns a fit of a part into one of the whole.
+
+    Args:
+        full: the model.
+        part: of it.
+    """
+
+    full: ShapeModel
+    part: Part
+
+    @staticmethod
+    def of(full: ShapeModel, region: str | tuple[int, ...]) -> RegionFit:
+        """Return the region fit of a model.
+
+        Raises:
+            InputError: there is no such region, or no triangle lies in it.
+        """
+        return RegionFit(full, Part.of(full, region))
+
+    def note(self, region: str | tuple[int, ...] | None) -> str:
+        """Return a sentence on what the fit is held to."""
+        called = f" {region!r}" if isinstance(region, str) else ""
+        inside = self.part.inside
+        return (
+            f"Held to the region{called} of {int(inside.sum()):,} of the model's {len(inside):,} vertices; the rest of "
+            "the surface is what the model makes of it."
+        )
+
+    def state(self, state: IcpState) -> IcpState:
+        """Return a state with the coefficients of the whole."""
+        return replace(state, b=self.part.to_b(state.b, self.full))
+
+    def telling(self, on_state: Callable[[IcpState], None]) -> Callable[[IcpState], None]:
+        """Return what tells `on_state` of such states."""
+        return lambda state: on_state(self.state(state))
+
+    def landmarks(self, model: ShapeModel) -> SurfaceLandmarks:
+        """Return the landmarks of `model` that lie in the region."""
+        return model.landmarks.within(self.part.inside)
+
+    def fitted(self, fitted: Fitted, modes: int | None) -> Fitted:
+        """Return where the fit ended with the first `modes` coefficients of the whole, None for all."""
+        from shapespace.fit.robust.posterior import variance_of_new_shapes  # compiled, and loads SciPy
+
+        full, part, k = self.full, self.part, modes
+        b = part.to_b(fitted.b, full)
+        known = np.diag(fitted.b_stddev**2) if fitted.b_covariance is None else fitted.b_covariance
+        variance = variance_of_new_shapes(full) if fitted.b_covariance is not None else full.stddev**2
+        covariance = part.to_covariance(known, full, variance)
+        after = np.clip(covariance.diagonal(), 0.0, variance)
+        vertices = fitted.T_scan_model.apply(full.reconstruct(b))
+        vertices[part.inside] = fitted.vertices_scan_mm
+        return replace(
+            fitted,
+            b=b[:k],
+            b_stddev=np.sqrt(after)[:k],
+            shrinkage=(1.0 - after / variance)[:k],
+            b_covariance=None if fitted.b_covariance is None else covariance[:k, :k],
+            vertices_scan_mm=vertices,
+            regions=self._regions(fitted),
+        )
+
+    def _regions(self, fitted: Fitted) -> Callable[[], IntArray]:
+        def find() -> IntArray:
+            regions = np.full(len(self.part.inside), UNSEEN, dtype=np.int32)
+            regions[self.part.inside] = fitted.regions()
+            return regions
+
+        return find
+
 
 _FAR_OUT = 3.0  # standard deviations; a normal coefficient exceeds them once in 370
 _FAR_OUT_BY_CHANCE = 0.01  # share of coefficients beyond it that raises no note; chance alone gives 0.3 %

@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 from shapespace.errors import InputError
-from shapespace.fit.diagnostics.evidence import FitEvidence, MatchEvidence
+from shapespace.fit.diagnostics.failure_model import FitEvidence, MatchEvidence
 from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, IntArray, Similarity
 

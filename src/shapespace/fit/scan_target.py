@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
+from shapespace.errors import FitError, InputError
 from shapespace.geometry.closest import ClosestPointEngine, ClosestPoints, VertexEngine, build_engine, finest_engine
-from shapespace.geometry.normals import boundary_vertices
-from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
+from shapespace.geometry.normals import boundary_vertices, part_of, rms_size
+from shapespace.model.shape_model import ShapeModel
+from shapespace.types import MM_PER_UNIT, BoolArray, FloatArray, IntArray, Mesh, Similarity
 
 _ROUNDS = 4
 """Of finding how much the larger areas must make up for vertices that are drawn for certain."""
@@ -89,3 +92,108 @@ class ScanTarget:
         if matches.triangle is None or matches.barycentric is None or self.mesh.faces is None:
             return matches.vertex[:, None], np.ones((len(matches.vertex), 1))
         return self.mesh.faces[matches.triangle], matches.barycentric
+
+
+KINDS = {"sphere": 4, "box": 6, "landmarks": 1}
+"""How many numbers each kind of crop needs."""
+_FEWEST = 30  # vertices; with fewer no fit has enough matches (`_FEWEST_MATCHES` of the robust method)
+
+
+@dataclass(frozen=True)
+class Crop:
+    """A part of space.
+
+    Args:
+        kind: a name of `KINDS`.
+        numbers: of a sphere its centre and radius, of a box two opposite corners, all in the scan's own frame and unit;
+            of landmarks how near to one of them, mm.
+
+    Raises:
+        InputError: numbers that make no such part.
+    """
+
+    kind: str
+    numbers: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        finite = all(np.isfinite(number) for number in self.numbers)
+        if KINDS.get(self.kind) != len(self.numbers) or not finite:
+            raise _no_crop(self.text)
+        if self.kind != "box" and self.numbers[-1] <= 0:
+            raise InputError(f"The crop {self.text!r} needs a radius above zero.")
+
+    @property
+    def text(self) -> str:
+        """As it is written on the command line."""
+        return f"{self.kind}:{','.join(f'{number:g}' for number in self.numbers)}"
+
+    @staticmethod
+    def of(text: str) -> Crop:
+        """Return the crop that `text` tells, such as `sphere:0,0,0,90`.
+
+        Raises:
+            InputError: it tells none.
+        """
+        kind, _, numbers = text.partition(":")
+        try:
+            return Crop(kind.strip(), tuple(float(number) for number in numbers.split(",")))
+        except ValueError as error:
+            if isinstance(error, InputError):
+                raise
+            raise _no_crop(text) from error
+
+    def cut(
+        self, scan: Mesh, model: ShapeModel, landmarks: Mapping[str, FloatArray] | None, unit: str
+    ) -> tuple[Mesh, str]:
+        """Return what of `scan` lies inside, and a sentence on it.
+
+        Args:
+            scan: in its own frame and unit.
+            model: whose landmarks tell the unit of the scan's.
+            landmarks: name -> (3,) of the scan.
+            unit: of the scan, or `auto`.
+
+        Raises:
+            FitError: hardly anything is left, or there are no landmarks to go by.
+        """
+        inside = self._inside(scan, model, landmarks, unit)
+        if inside.sum() < _FEWEST:
+            low, high = (np.array2string(f(scan.vertices, axis=0), precision=4) for f in (np.nanmin, np.nanmax))
+            raise FitError(
+                f"{scan.name}: the crop {self.text} leaves {inside.sum()} of its {len(inside)} vertices, which lie "
+                f"between {low} and {high}; give a crop in the scan's own frame and unit."
+            )
+        note = f"Cropped to {inside.sum():,} of {len(inside):,} vertices ({self.text})."
+        return part_of(scan, inside), note
+
+    def _inside(
+        self, scan: Mesh, model: ShapeModel, landmarks: Mapping[str, FloatArray] | None, unit: str
+    ) -> BoolArray:
+        x = scan.vertices
+        if self.kind == "box":
+            corners = np.reshape(self.numbers, (2, 3))
+            return np.asarray(((x >= corners.min(axis=0)) & (x <= corners.max(axis=0))).all(axis=1))
+        if self.kind == "sphere":
+            return np.asarray(np.linalg.norm(x - np.array(self.numbers[:3]), axis=1) <= self.numbers[3])
+        if not landmarks:
+            raise FitError(f"{scan.name}: the crop {self.text} needs landmarks, and none are given for it.")
+        points = np.stack(list(landmarks.values()))
+        mm = MM_PER_UNIT[unit if unit != "auto" else _unit(model, landmarks, scan.name)]
+        inside = np.zeros(len(x), dtype=np.bool_)
+        for point in points:
+            inside |= np.linalg.norm(x - point, axis=1) * mm <= self.numbers[0]
+        return inside
+
+
+def _no_crop(text: str) -> InputError:
+    return InputError(f"There is no crop {text!r}; give sphere:X,Y,Z,R or box:X,Y,Z,X,Y,Z or landmarks:MM.")
+
+
+def _unit(model: ShapeModel, landmarks: Mapping[str, FloatArray], scan_name: str) -> str:
+    """Return the unit in which the landmarks lie about as far apart as the model's."""
+    shared = [name for name in model.landmarks if name in landmarks]
+    there = rms_size(np.stack([landmarks[name] for name in shared])) if len(shared) > 1 else 0.0
+    if there == 0.0:
+        raise FitError(f"{scan_name}: its landmarks do not determine its unit, which the crop needs; give --unit.")
+    ratio = there / rms_size(model.landmarks.select(shared).interpolate(model.mean_vertices))
+    return min(MM_PER_UNIT, key=lambda unit: abs(float(np.log(ratio * MM_PER_UNIT[unit]))))

@@ -7,8 +7,7 @@ from shapespace.lazy import lazy_names
 if TYPE_CHECKING:
     from shapespace.recognise.classifier_file import SavedClassifier
     from shapespace.recognise.classifiers import CLASSIFIERS
-    from shapespace.recognise.predict import ScanPrediction, train_classifier
-    from shapespace.recognise.shape_space import ShapeSpace
+    from shapespace.recognise.predict import ScanPrediction, ShapeSpace, train_classifier
 
 __all__ = [
     "CLASSIFIERS",
@@ -22,7 +21,6 @@ __getattr__, __dir__ = lazy_names(
     {
         "recognise.classifier_file": ("SavedClassifier",),
         "recognise.classifiers": ("CLASSIFIERS",),
-        "recognise.predict": ("ScanPrediction", "train_classifier"),
-        "recognise.shape_space": ("ShapeSpace",),
+        "recognise.predict": ("ScanPrediction", "ShapeSpace", "train_classifier"),
     },
 )

@@ -23,9 +23,9 @@ from shapespace.errors import FileFormatError, InputError
 from shapespace.io.containers.archives import npy_array, zip_members
 from shapespace.io.containers.json_files import check_file, plain_json
 from shapespace.io.files import read_bytes, write_bytes
-from shapespace.recognise.classification_scores import calibrated
 from shapespace.recognise.classifiers import CLASSIFIERS
 from shapespace.recognise.learn import SVC, Pipeline, skops_io
+from shapespace.recognise.predictions import calibrated
 from shapespace.reprs import short_repr
 from shapespace.types import FloatArray
 from shapespace.version import __version__

@@ -6,44 +6,304 @@ the tests against shuffled labels and the learning curves. Maps of where classes
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, cast
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from shapespace.errors import InputError
-from shapespace.recognise.classification_scores import (
-    Calibration,
-    ClassScores,
-    IndexArray,
-    calibrated,
-    calibration,
-    confusion,
-    fit_temperature,
-    macro_accuracy,
-    per_class,
-    subject_bootstrap,
-)
+from shapespace.recognise.classifiers import CLASSIFIERS, LDA_SHRINKAGE, linear_rule
 from shapespace.recognise.predictions import (
     MODES,
+    Calibration,
     Choice,
+    ClassScores,
     Fold,
+    IndexArray,
     Predictions,
+    calibrated,
+    calibration,
+    classes_of,
+    confusion,
     cross_validated_probabilities,
+    fit_temperature,
     fixed_predictions,
     folds_of,
+    likeliest_classes,
+    macro_accuracy,
     nested_predictions,
+    per_class,
     predict_probabilities,
+    refuse_unknown,
+    subject_bootstrap,
     subject_folds,
-)
-from shapespace.recognise.resampling import (
-    LearningCurve,
-    PermutationTest,
-    learning_curve,
-    mode_importance,
-    permutation_test,
+    usable_training_rows,
 )
 from shapespace.types import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class PermutationTest:
+    """Macro accuracy, and its null distribution under permuted labels.
+
+    Args:
+        observed: with the labels as they are.
+        null: (P,) with labels shuffled within each subject.
+        p: how often shuffled labels did at least as well, counting the observed ones.
+    """
+
+    observed: float
+    null: FloatArray
+    p: float
+
+
+@dataclass(frozen=True, eq=False)
+class LearningCurve:
+    """Macro accuracy against the number of training subjects.
+
+    Args:
+        subjects: (S,) people in each training set.
+        macro_accuracy: (S, R) one column a repeat.
+    """
+
+    subjects: IndexArray
+    macro_accuracy: FloatArray
+
+    @property
+    def mean(self) -> FloatArray:
+        """Mean over the repeats, (S,)."""
+        return self.macro_accuracy.mean(axis=1)
+
+
+def permutation_test(
+    folds: Sequence[Fold], classifier: str = "lda", *, permutations: int = 200, seed: int = 0
+) -> PermutationTest:
+    """Test whether labels mean anything, by shuffling them within each person.
+
+    A person's labels are shuffled alike in every fold, so that the whole experiment is run again with wrong labels. The
+    rows of a person must therefore come in the same order in every fold. LDA is solved in closed form, which takes
+    milliseconds; other classifiers take their time.
+
+    Args:
+        folds: the outer folds.
+        classifier: a name of `CLASSIFIERS`, with its own settings.
+        permutations: how many.
+        seed: of the permutations.
+
+    Raises:
+        InputError: no folds, an unknown classifier, or people whose number of rows differs between folds.
+    """
+    classes = classes_of(folds)
+    refuse_unknown([classifier])
+    counts: dict[str, int] = {}
+    for fold in folds:
+        for part in (fold.train_subjects, fold.test_subjects):
+            names, rows = np.unique(np.asarray(part, dtype=str), return_counts=True)
+            for name, n in zip(names.tolist(), rows.tolist(), strict=True):
+                if counts.setdefault(name, n) != n:
+                    raise InputError(
+                        f"{name} has {counts[name]} rows in one fold and {n} in another; keep failed fits as rows that "
+                        "are not finite."
+                    )
+    prepared = [_prepare(fold, classes) for fold in folds]
+    score = _score_lda if classifier == "lda" else _score_any
+    rng = np.random.default_rng(seed)
+    with threadpool_limits(1):
+        observed = score(prepared, classes, {}, classifier, seed)
+        null = [
+            score(prepared, classes, {name: rng.permutation(n) for name, n in counts.items()}, classifier, seed)
+            for _ in range(permutations)
+        ]
+    p = (1 + sum(value >= observed - 1e-12 for value in null)) / (1 + permutations)
+    return PermutationTest(observed, np.asarray(null), p)
+
+
+@dataclass(frozen=True, eq=False)
+class _Prepared:
+    """A fold with data that does not depend on the labels: rows of each subject, scaled training rows, their Gram
+    matrix.
+    """
+
+    fold: Fold
+    train_labels: Any
+    test_labels: Any
+    train_rows: Mapping[str, IndexArray]
+    test_rows: Mapping[str, IndexArray]
+    finite: Any
+    X: FloatArray
+    test: FloatArray
+    gram: FloatArray = field(repr=False)
+
+
+def _prepare(fold: Fold, classes: Sequence[str]) -> _Prepared:
+    finite = np.isfinite(fold.train).all(axis=1)
+    X = fold.train[finite]
+    mean, spread = X.mean(axis=0), X.std(axis=0)
+    spread[spread < 1e-12] = 1.0
+    X = (X - mean) / spread
+    names = np.asarray(classes)
+    return _Prepared(
+        fold=fold,
+        train_labels=np.searchsorted(names, np.asarray(fold.train_labels, dtype=str)),
+        test_labels=np.searchsorted(names, np.asarray(fold.test_labels, dtype=str)),
+        train_rows=_rows(fold.train_subjects),
+        test_rows=_rows(fold.test_subjects),
+        finite=finite,
+        X=X,
+        test=(fold.test - mean) / spread,
+        gram=X.T @ X,
+    )
+
+
+def _rows(subjects: Sequence[str]) -> dict[str, IndexArray]:
+    people = np.asarray(subjects, dtype=str)
+    return {name: np.flatnonzero(people == name) for name in np.unique(people).tolist()}
+
+
+def _shuffled(labels: Any, rows: Mapping[str, IndexArray], order: Mapping[str, IndexArray]) -> Any:
+    if not order:
+        return labels
+    out = labels.copy()
+    for name, subject_rows in rows.items():
+        out[subject_rows] = labels[subject_rows][order[name]]
+    return out
+
+
+def _score_lda(
+    folds: Sequence[_Prepared], classes: Sequence[str], order: Mapping[str, IndexArray], classifier: str, seed: int
+) -> float:
+    hits, counts = np.zeros(len(classes)), np.zeros(len(classes))
+    unit = np.eye(len(classes))
+    for p in folds:
+        member = unit[_shuffled(p.train_labels, p.train_rows, order)[p.finite]]
+        present = np.flatnonzero(member.any(axis=0))
+        coef, intercept = linear_rule(p.X, member[:, present], p.gram, LDA_SHRINKAGE)
+        scores = p.test @ coef.T + intercept
+        undefined = np.isnan(scores).any(axis=1)
+        predicted = np.where(undefined, -1, present[np.where(np.isnan(scores), -np.inf, scores).argmax(axis=1)])
+        truth = _shuffled(p.test_labels, p.test_rows, order)
+        hits += np.bincount(truth[predicted == truth], minlength=len(classes))
+        counts += np.bincount(truth, minlength=len(classes))
+    return float((hits[counts > 0] / counts[counts > 0]).mean())
+
+
+def _score_any(
+    folds: Sequence[_Prepared], classes: Sequence[str], order: Mapping[str, IndexArray], classifier: str, seed: int
+) -> float:
+    names = np.asarray(classes)
+    truth: list[str] = []
+    answers: list[str] = []
+    for p in folds:
+        labels = names[_shuffled(p.train_labels, p.train_rows, order)][p.finite]
+        probabilities = predict_probabilities(
+            X=p.fold.train[p.finite],
+            labels=labels,
+            test=p.fold.test,
+            classes=classes,
+            classifier=classifier,
+            parameters={},
+            seed=seed,
+        )
+        truth += names[_shuffled(p.test_labels, p.test_rows, order)].tolist()
+        answers += likeliest_classes(probabilities, classes).tolist()
+    return macro_accuracy(truth, answers, classes)
+
+
+def learning_curve(
+    folds: Sequence[Fold],
+    classifier: str = "lda",
+    subject_counts: Sequence[int] = (5, 10, 20, 40, 80),
+    *,
+    repeats: int = 5,
+    seed: int = 0,
+) -> LearningCurve:
+    """Return the macro accuracy on all test samples against the number of training people, drawn at random.
+
+    The coefficients stay those of the fold's own model; only the classifier sees fewer people.
+
+    Args:
+        folds: the outer folds.
+        classifier: a name of `CLASSIFIERS`, with its own settings.
+        subject_counts: people to train on; those that a fold does not have are left out of the curve.
+        repeats: draws of people.
+        seed: of the draws.
+
+    Raises:
+        InputError: no folds, an unknown classifier, or no fold with so many people.
+    """
+    classes = classes_of(folds)
+    refuse_unknown([classifier])
+    fewest = min(len(set(fold.train_subjects)) for fold in folds)
+    counts = [n for n in subject_counts if 1 <= n <= fewest]
+    if not counts or repeats < 1:
+        raise InputError(f"The folds have {fewest} subjects to train on, so the learning curve has no point to show.")
+    rng = np.random.default_rng(seed)
+    curve = np.zeros((len(counts), repeats))
+    truth = [label for fold in folds for label in fold.test_labels]
+    with threadpool_limits(1):
+        for i, j in itertools.product(range(len(counts)), range(repeats)):
+            answers: list[str] = []
+            for fold in folds:
+                X, labels, subjects = usable_training_rows(fold)
+                people = rng.choice(np.unique(np.asarray(fold.train_subjects, dtype=str)), counts[i], replace=False)
+                is_train = np.isin(subjects, people)
+                probabilities = predict_probabilities(
+                    X=X[is_train],
+                    labels=labels[is_train],
+                    test=fold.test,
+                    classes=classes,
+                    classifier=classifier,
+                    parameters={},
+                    seed=seed,
+                )
+                answers += likeliest_classes(probabilities, classes).tolist()
+            curve[i, j] = macro_accuracy(truth, answers, classes)
+    return LearningCurve(np.asarray(counts, dtype=np.int64), curve)
+
+
+def mode_importance(
+    folds: Sequence[Fold], classifier: str = "lda", *, modes: int | None = None, repeats: int = 5, seed: int = 0
+) -> FloatArray:
+    """Return the loss of macro accuracy, (F, K), when one mode is permuted among the test samples of a fold.
+
+    Modes of folds with shape models of their own agree only about; read the mean over the folds with that in mind.
+
+    Args:
+        folds: the outer folds.
+        classifier: a name of `CLASSIFIERS`, with its own settings.
+        modes: number of leading modes that it sees; None is all. The others have importance 0.
+        repeats: shuffles of each mode, whose losses are averaged.
+        seed: of the shuffles.
+
+    Raises:
+        InputError: no folds, or an unknown classifier.
+    """
+    from sklearn.inspection import permutation_importance  # pyright: ignore[reportUnknownVariableType]
+
+    classes = classes_of(folds)
+    refuse_unknown([classifier])
+
+    def score(pipeline: Any, test: FloatArray, truth: Any) -> float:
+        return macro_accuracy(truth, pipeline.predict(test), classes)
+
+    loss = np.zeros((len(folds), folds[0].train.shape[1]))
+    with threadpool_limits(1):
+        for f, fold in enumerate(folds):
+            X, labels, _ = usable_training_rows(fold)
+            m = min(modes or X.shape[1], X.shape[1])
+            finite = np.isfinite(fold.test).all(axis=1)
+            test, truth = fold.test[finite, :m], np.asarray(fold.test_labels, dtype=str)[finite]
+            pipeline: Any = CLASSIFIERS[classifier](seed)
+            pipeline.fit(X[:, :m], labels)
+            importances = cast(Any, permutation_importance)(
+                pipeline, test, truth, scoring=score, n_repeats=repeats, random_state=seed
+            )
+            loss[f, :m] = importances.importances_mean
+    return loss
+
 
 __all__ = [
     "MODES",

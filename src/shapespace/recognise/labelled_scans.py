@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.cohort.labels import Labels
-from shapespace.cohort.table import names_of_file
+from shapespace.cohort.table import Labels, names_of_file
 from shapespace.errors import FileFormatError, InputError
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import read_bytes

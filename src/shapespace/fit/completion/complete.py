@@ -21,12 +21,12 @@ from shapespace.errors import FitError, InputError
 from shapespace.fit.completion.shape_posterior import AS_LIKELY, OTHER_SIZE, ShapePosterior, shape_posterior
 from shapespace.fit.completion.surface_calibration import SurfaceCalibration, calibrate
 from shapespace.fit.dense.dense_fit import dense_surface
-from shapespace.fit.diagnostics.odd_scans import converged_reason
+from shapespace.fit.diagnostics.failure_model import converged_reason
 from shapespace.fit.diagnostics.reasons import Reason, ReasonCode, sentence_of
 from shapespace.fit.fit_scan import FitConfig, fit_scan
-from shapespace.fit.landmark_terms import SHARE, LandmarkConstraint
 from shapespace.fit.result import FitResult, Status
 from shapespace.fit.robust.kernels import Float32Array
+from shapespace.fit.robust.prepared_model import SHARE, LandmarkConstraint
 from shapespace.fit.robust.robust_settings import RobustSettings
 from shapespace.fit.scan_target import ScanTarget, mm_frame
 from shapespace.fit.search.initialisation import start_from_any_pose

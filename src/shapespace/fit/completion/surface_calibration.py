@@ -12,8 +12,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from shapespace.errors import FitError
-from shapespace.fit.completion.leave_one_out import root_of
-from shapespace.fit.completion.shape_posterior import ShapePosterior, shape_posterior
+from shapespace.fit.completion.shape_posterior import ShapePosterior, root_of, shape_posterior
 from shapespace.fit.robust.kernels import Float32Array
 from shapespace.fit.robust.robust_settings import RobustSettings
 from shapespace.fit.scan_target import ScanTarget

@@ -26,9 +26,8 @@ from scipy.linalg import LinAlgError
 
 from shapespace.errors import FitError
 from shapespace.fit.dense.residual_modes import residual_modes
-from shapespace.fit.diagnostics.evidence import MatchEvidence
+from shapespace.fit.diagnostics.failure_model import MatchEvidence
 from shapespace.fit.iteration_state import BORDER, FOLLOWED, REJECTED, UNSEEN, IcpState, RobustFitted
-from shapespace.fit.landmark_terms import LandmarkConstraint, worth
 from shapespace.fit.robust.matching import (
     Gathered,
     Matcher,
@@ -40,15 +39,26 @@ from shapespace.fit.robust.matching import (
     spread,
     tails,
 )
-from shapespace.fit.robust.normal_equations import Estimate, NormalEquations, Prior, normal_equations, small_similarity
 from shapespace.fit.robust.posterior import (
+    Estimate,
+    NormalEquations,
     Posterior,
+    Prior,
     covariance_of_landmarks,
     lack_of_new_shapes,
+    normal_equations,
     posterior,
+    small_similarity,
     variance_of_new_shapes,
 )
-from shapespace.fit.robust.prepared_model import LinearShape, ModelSurface, PreparedModel, prepare
+from shapespace.fit.robust.prepared_model import (
+    LandmarkConstraint,
+    LinearShape,
+    ModelSurface,
+    PreparedModel,
+    prepare,
+    worth,
+)
 from shapespace.fit.robust.robust_settings import Level, RobustSettings
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.search.initialisation import Start

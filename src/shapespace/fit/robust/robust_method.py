@@ -8,13 +8,16 @@ from typing import ClassVar
 
 import numpy as np
 
-from shapespace.fit.diagnostics.evidence import FitEvidence, ScanEvidence
-from shapespace.fit.diagnostics.failure_model import estimate_error, find_failure_reasons, with_mirror_image
-from shapespace.fit.diagnostics.odd_scans import (
+from shapespace.fit.diagnostics.failure_model import (
+    FitEvidence,
+    ScanEvidence,
     converged_reason,
+    estimate_error,
+    find_failure_reasons,
     find_odd_scan_reasons,
     has_displaced_parts,
     is_side_undecidable,
+    with_mirror_image,
 )
 from shapespace.fit.diagnostics.reasons import Reason
 from shapespace.fit.iteration_state import SHOWN, Fitted, IcpState, RobustFitted

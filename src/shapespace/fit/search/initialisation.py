@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from shapespace.errors import FitError, InputError
-from shapespace.fit.landmark_terms import LandmarkConstraint
+from shapespace.fit.robust.prepared_model import LandmarkConstraint
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, FloatArray, Mesh, Similarity

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from shapespace.errors import InputError
-from shapespace.geometry.distortion import factor_to_draw, flip_factor
-from shapespace.geometry.normals import rms_size
+from shapespace.geometry.normals import factor_to_draw, flip_factor, rms_size
 from shapespace.report.analyses.analysis_report import (
     MOST_LANDMARKS,
     REDUCED_MORPH_NOTE,

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.cohort.table import list_names
-from shapespace.geometry.distortion import factor_to_draw, flip_factor
+from shapespace.geometry.normals import factor_to_draw, flip_factor
 from shapespace.report.analyses.analysis_report import (
     REDUCED_MORPH_NOTE,
     AnalysisReport,

@@ -23,8 +23,7 @@ from shapespace.errors import FileFormatError, InputError, ShapespaceError
 from shapespace.fit.diagnostics.reasons import text_of
 from shapespace.fit.fit_scan import FitConfig
 from shapespace.fit.iteration_state import REGIONS, SHOWN
-from shapespace.fit.result import STAGES, FitResult
-from shapespace.fit.stages import STAGES_VERSION, stage_arrays
+from shapespace.fit.result import STAGES, STAGES_VERSION, FitResult, stage_arrays
 from shapespace.geometry.closest import build_engine, on_boundary, surface_distances
 from shapespace.geometry.doctor import repair
 from shapespace.geometry.normals import boundary_vertices

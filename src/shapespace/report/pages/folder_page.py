@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.cohort.labels import LABELS_FILE, Label, read_labels
-from shapespace.cohort.table import names_of_file
+from shapespace.cohort.table import LABELS_FILE, Label, names_of_file, read_labels
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report import figures
