@@ -404,7 +404,7 @@ def _floor(model: ShapeModel, scan: SimulatedScan) -> VertexErrors:
 
 def _paper_table(folder: Path, first: ExpressionsOfOne, second: ManyPeople) -> list[Claim]:
     """Return what the paper states beside what this run measured."""
-    tests = [fit for fit in first.fits if fit.result and fit.expression != "neutral"]
+    tests = [fit for fit in first.fits if fit.stages and fit.expression != "neutral"]
     distances = [_to_scan(folder, fit) for fit in tests]
     worst = sorted(distances, key=lambda stages: -stages["before"].max)[:2]
     largest, means = [stages["final"].max for stages in distances], [stages["final"].mean for stages in distances]
@@ -448,7 +448,7 @@ def _claim(folder: Path, case: Case) -> Claim:
     """Return what the paper states of its real scan beside one case of experiment 2."""
     fit, truth = case.fit, None
     measured = f"failed: {fit.reason}"
-    if fit.result:
+    if fit.stages:
         stages = _to_scan(folder, fit)
         before, final = stages["before"], stages["final"]
         measured = (

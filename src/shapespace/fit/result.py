@@ -66,7 +66,7 @@ class Stage:
         moved_mm: RMS displacement of such a surface along its normals over seen vertices, mm of the scan.
 
     Example:
-        >>> sorted(fit.result)
+        >>> sorted(fit.stages)
         ['before', 'final', 'initial']
     """
 
