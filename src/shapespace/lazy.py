@@ -17,6 +17,9 @@ from shapespace.errors import ShapespaceError
 
 LAZY_FUNCTIONS: Mapping[str, str] = MappingProxyType(
     {
+        "BuildConfig": "model.build_model",
+        "build_model": "model.build_model",
+        "extend_model": "model.build_model",
         "html_of_additive_model": "report.notebook",
         "html_of_analysis": "report.notebook",
         "html_of_cohort": "report.notebook",

@@ -106,7 +106,7 @@ def test_the_table_has_the_columns_of_the_contract_in_order(tmp_path: Path, resu
     assert float(rows[0]["model_to_scan_mean_mm"]) == result.distances.model_to_scan.mean
     assert (rows[1]["status"], rows[1]["reason"]) == ("failed", "two.ply is empty, so re-export it.")
     assert header[-1] == "model_hash"
-    assert {row["model_hash"] for row in rows} == {MODEL.content_hash}
+    assert {row["model_hash"] for row in rows} == {MODEL.hash}
     assert all(not rows[1][name] for name in header[3:-1] if name != "checksum")
     assert rows[0]["checksum"] != rows[1]["checksum"]
 
@@ -192,7 +192,7 @@ def test_the_iterations_kept_end_in_the_final_surface(tmp_path: Path, result: Fi
 
 def test_sources_are_told_relative_to_the_results(tmp_path: Path) -> None:
     source = source_of(tmp_path / "models" / "m.h5", "h", tmp_path / "out")
-    assert source.to_file() == File(name="m.h5", hash="h", path="../models/m.h5")
+    assert source == File(name="m.h5", hash="h", path="../models/m.h5")
 
 
 @pytest.mark.parametrize("content", ["", "{", '{"scan": 1', "[]", '{"format": "other"}', "nonsense"])

@@ -8,15 +8,15 @@ from contextlib import AbstractContextManager, ExitStack, closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from shapespace.batch.executors import Team
 from shapespace.batch.progress import tell_after
+from shapespace.batch.workers import Team
 from shapespace.errors import FitError, InputError, ShapespaceError
 from shapespace.version import __version__
 
 if TYPE_CHECKING:
     from distributed import Client
 
-    from shapespace.batch.executors import Work
+    from shapespace.batch.workers import Work
 
 T = TypeVar("T")
 R = TypeVar("R")

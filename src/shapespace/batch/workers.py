@@ -1,4 +1,4 @@
-"""Worker processes: one server loads the code once, and each worker is a copy of it that ends with its parent.
+"""Worker processes: one server loads the code once, each worker is a copy of it, and a team of workers does many tasks.
 
 This module imports nothing heavy, so that the server can start before the rest of the program is loaded.
 
@@ -16,11 +16,30 @@ import signal
 import sys
 import tempfile
 import threading
+import time
+from collections import deque
 from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from multiprocessing.connection import wait
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast
 
 from shapespace.errors import FitError
+
+TaskT = TypeVar("TaskT", contravariant=True)
+AnswerT = TypeVar("AnswerT", covariant=True)
+
+ATTEMPTS = 2
+"""Number of workers that a task may cost before it is given up."""
+GRACE_S = 5.0
+"""Time for running tasks to end when a run is stopped; a second Ctrl-C ends them at once."""
+_STARTS = 3  # worker pools in a row that may fail to start: one failure can be chance, three are the machine
+_FOREVER = float("inf")
+_NO_START = (
+    "Worker processes end as they start; use --jobs 1, free some memory, or, in a script of your own, put what it does "
+    'under if __name__ == "__main__".'
+)
 
 MARK = "SHAPESPACE_MESSAGE_MARK"
 """Environment variable of the server of the workers alone: a folder that the first process to print creates."""
@@ -66,6 +85,7 @@ WARM_UP = "SHAPESPACE_WARM_UP"
 """Set for the server alone: `notify` if it may print on standard error that it compiles, else `quiet`."""
 COPIED = sys.platform == "linux"
 """Whether workers are copies of one server. Apple's BLAS does not survive a fork, and Windows has none."""
+_WARM = "shapespace.batch.warm"  # loads the code of a fit; imports this module
 _BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -87,11 +107,9 @@ def start_loading(*, notify: bool) -> None:
     """
     mark = share_mark() if notify else remove_mark()
     if not COPIED:
-        from shapespace.batch.warm import warm_up
-
-        warm_up(notify=notify)
+        import_module(_WARM).warm_up(notify=notify)
         return
-    preload(("shapespace.batch.warm",), {WARM_UP: "notify" if notify else "quiet", MARK: mark})
+    preload((_WARM,), {WARM_UP: "notify" if notify else "quiet", MARK: mark})
 
 
 def preload(modules: Sequence[str], environment: Mapping[str, str] | None = None) -> None:
@@ -236,3 +254,154 @@ def interrupts_ignored() -> Generator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+class Work(Protocol[TaskT, AnswerT]):
+    """What is done with each task: frozen, small, and sent to every worker.
+
+    It names the data that the tasks share by path or hash; `do` loads them once in each process (`Shared`,
+    `LatestValue`).
+    """
+
+    def do(self, task: TaskT, /) -> AnswerT:
+        """Do one task; an error of the task itself is part of the answer.
+
+        Raises:
+            ShapespaceError: an error that would stop every other task too, such as a full disk.
+        """
+        ...
+
+    def give_up(self, task: TaskT, reason: str, /) -> AnswerT:
+        """Return the answer for a task that could not be done; `do` in the same run then returns it too."""
+        ...
+
+
+@dataclass
+class _Assignment:
+    """The task of a worker by its number, None while it starts or waits for one, and when it must have ended."""
+
+    number: int | None = None
+    deadline: float = _FOREVER
+
+
+class Team:
+    """Worker processes that are started when needed and stay for further tasks; each has a pipe of its own.
+
+    Args:
+        work: what they do.
+        size: largest number of workers.
+        timeout_s: a task that takes longer is given up; None for no limit.
+        quiet: whether the first worker does not report that code is compiled.
+
+    Raises:
+        FitError: no process can be started.
+    """
+
+    def __init__(self, work: Work[Any, Any], size: int, timeout_s: float | None, *, quiet: bool = True) -> None:
+        self._work, self._size, self._timeout_s = work, size, timeout_s
+        self._assignments: dict[Worker, _Assignment] = {}
+        self._idle: list[Worker] = []
+        self._failed_starts = 0
+        start_loading(notify=not quiet)
+        wait_until_loaded()
+        self._stack = contextlib.ExitStack()
+        self._life = self._stack.enter_context(life_line())
+
+    def run(self, tasks: Sequence[Any]) -> Generator[tuple[int, Any]]:
+        """Yield the number of each task and its answer.
+
+        Raises:
+            FitError: no process can be started.
+            ShapespaceError: raised by the work.
+        """
+        waiting, deaths, left = deque(range(len(tasks))), [0] * len(tasks), len(tasks)
+        while left:
+            while waiting and self._idle:
+                self._assign(self._idle.pop(), waiting.popleft(), tasks)
+            while len(self._assignments) + len(self._idle) < min(self._size, left):
+                self._assignments[Worker(_serve, (self._work,), self._life)] = _Assignment()
+            for worker in self._ready():
+                assignment = self._assignments.pop(worker)
+                number, answer = assignment.number, worker.answer()
+                if answer is not None:
+                    self._failed_starts = 0
+                    self._idle.append(worker)
+                    if waiting:
+                        self._assign(self._idle.pop(), waiting.popleft(), tasks)
+                    if number is not None:
+                        left -= 1
+                        yield number, _value(answer)
+                    continue
+                late_s = None if time.monotonic() < assignment.deadline else self._timeout_s
+                code = worker.stop()
+                if number is None:
+                    self._failed_starts += 1
+                    if self._failed_starts >= _STARTS:
+                        raise FitError(_NO_START)
+                    continue
+                deaths[number] += 1
+                if late_s is None and deaths[number] < ATTEMPTS:
+                    waiting.append(number)
+                    continue
+                left -= 1
+                yield number, self._work.give_up(tasks[number], _reason_of_death(code, late_s))
+
+    def close(self) -> None:
+        """Give running tasks a moment to end, then end every worker."""
+        try:
+            deadline = time.monotonic() + GRACE_S
+            running = {worker.line for worker, one in self._assignments.items() if one.number is not None}
+            while running and (left_s := deadline - time.monotonic()) > 0:
+                running.difference_update(wait(running, left_s))
+        finally:
+            for worker in (*self._assignments, *self._idle):
+                worker.stop()
+            self._assignments.clear()
+            self._idle.clear()
+            self._stack.close()
+
+    def _assign(self, worker: Worker, number: int, tasks: Sequence[Any]) -> None:
+        deadline = _FOREVER if self._timeout_s is None else time.monotonic() + self._timeout_s
+        self._assignments[worker] = _Assignment(number, deadline)
+        worker.give(tasks[number])
+
+    def _ready(self) -> list[Worker]:
+        """Wait, and return the workers that have answered, died, or taken too long."""
+        first = min(one.deadline for one in self._assignments.values())
+        timeout_s = None if first == _FOREVER else max(0.0, first - time.monotonic())
+        lines = set(wait([worker.line for worker in self._assignments], timeout_s))
+        now = time.monotonic()
+        return [worker for worker, one in self._assignments.items() if worker.line in lines or now >= one.deadline]
+
+
+def _reason_of_death(code: int, late_s: float | None) -> str:
+    """Return why a worker did not answer, by its exit code, or the time limit of its task."""
+    if late_s is not None:
+        return f"it took more than the {late_s:g} s of --set timeout"
+    cause = f"by signal {-code}" if code < 0 else f"with exit code {code}"
+    return f"its worker ended {cause}, {ATTEMPTS} times, most likely for lack of memory; thin it, or use fewer --jobs"
+
+
+def _serve(line: Connection, work: Work[Any, Any]) -> None:
+    """Do the tasks that arrive on `line` until it ends; runs in the worker process."""
+    from threadpoolctl import threadpool_limits
+
+    threadpool_limits(1)
+    line.send(())
+    while True:
+        try:
+            task = line.recv()
+        except EOFError:
+            return
+        try:
+            answer = (True, work.do(task))
+        except Exception as error:
+            answer = (False, error)
+        line.send(answer)
+
+
+def _value(answer: tuple[bool, Any]) -> Any:
+    done, value = answer
+    if not done:
+        raise value
+    return value

@@ -158,7 +158,10 @@ def build(
     files, records = _trusted(listed.files, notes, with_doubtful=config.with_doubtful)
     make_folder(output.absolute().parent)
     on_disk = SurfacesOnDisk(files, listed, config.unit, ", so no shape model can be made of it; leave it out")
-    streamed = config.streams or (config.of_vertices and bool(streaming_note(on_disk, config.model)))
+    streamed = config.streams or (
+        config.of_vertices
+        and bool(streaming_note(on_disk, modes=config.model.modes, out_of_core=config.model.out_of_core))
+    )
     loaded = [] if streamed else on_disk.read(quiet=quiet)
     first = on_disk[0] if streamed else loaded[0]
     if listed.unit_ratios:

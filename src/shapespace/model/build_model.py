@@ -151,7 +151,9 @@ def build_model(
     kind = representation_named(config.representation, config.control_points)
     if kind is not Vertices and (config.out_of_core or keep_shapes is not None):
         raise InputError("Only models of vertices can be made of streamed meshes; leave --representation out.")
-    streaming = streaming_note(meshes, config) if kind is Vertices and keep_shapes is None else ""
+    streaming = ""
+    if kind is Vertices and keep_shapes is None:
+        streaming = streaming_note(meshes, modes=config.modes, out_of_core=config.out_of_core)
     if config.out_of_core or keep_shapes is not None or streaming:
         stream = aligned_on_disk(
             meshes,

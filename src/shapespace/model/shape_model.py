@@ -221,9 +221,7 @@ class ShapeModel:
 
         The arguments are those of `build_model` and the fields of `BuildConfig`.
         """
-        from shapespace.model.build_model import BuildConfig, build_model  # imports this module
-
-        config = BuildConfig(
+        config = lazy_import("BuildConfig")(
             modes=modes,
             gauge=gauge,
             align=align,
@@ -238,7 +236,7 @@ class ShapeModel:
             out_of_core=out_of_core,
             without_training_shapes=without_training_shapes,
         )
-        return build_model(meshes, config, scratch=scratch, keep_shapes=keep_shapes, log=tell)
+        return lazy_import("build_model")(meshes, config, scratch=scratch, keep_shapes=keep_shapes, log=tell)
 
     def with_more(
         self,
@@ -254,10 +252,10 @@ class ShapeModel:
         tell: Tell | None = None,
     ) -> ShapeModel:
         """Return the model of the shapes that this one was made of and of `meshes`; see `build_model.extend_model`."""
-        from shapespace.model.build_model import BuildConfig, extend_model  # imports this module
-
-        config = BuildConfig(modes=modes, provenance=provenance, licence=licence, seed=seed)
-        return extend_model(self, meshes, shapes, config, scratch=scratch, keep_shapes=keep_shapes, log=tell)
+        config = lazy_import("BuildConfig")(modes=modes, provenance=provenance, licence=licence, seed=seed)
+        return lazy_import("extend_model")(
+            self, meshes, shapes, config, scratch=scratch, keep_shapes=keep_shapes, log=tell
+        )
 
     @property
     def _vector(self) -> FloatArray:

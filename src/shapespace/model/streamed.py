@@ -15,7 +15,7 @@ import tempfile
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, cast
+from typing import Any, Protocol, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -41,9 +41,6 @@ from shapespace.model.choose_modes import drawn, number_of_modes, rounding_mm
 from shapespace.model.pca import ALL_EQUAL, Modes, PrincipalComponents, checked_large_modes, principal_components
 from shapespace.model.training_shapes import TrainingShapes
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, common_faces
-
-if TYPE_CHECKING:
-    from shapespace.model.build_model import BuildConfig
 
 Tell: TypeAlias = Callable[[str], None]
 _SHAPES, _START, _POSES, _ALIGNED = "shapes.f32", "start.npz", "poses.npz", "aligned"
@@ -255,11 +252,11 @@ def bytes_in_memory(count: int, mesh: Mesh, *, choose: bool) -> int:
     return int(count * (vertices + triangles) + 2 * 8 * count**2)
 
 
-def streaming_note(meshes: Meshes, config: BuildConfig) -> str:
+def streaming_note(meshes: Meshes, *, modes: Modes, out_of_core: bool | None) -> str:
     """Return why meshes that nobody asked to stream must be streamed, in a sentence; empty if they fit into memory."""
-    if config.out_of_core is not None or len(meshes) < 2:
+    if out_of_core is not None or len(meshes) < 2:
         return ""
-    needed, free = bytes_in_memory(len(meshes), meshes[0], choose=config.modes == "auto"), available_bytes()
+    needed, free = bytes_in_memory(len(meshes), meshes[0], choose=modes == "auto"), available_bytes()
     if free is None or needed <= _MOST_OF_MEMORY * free:
         return ""
     return (
