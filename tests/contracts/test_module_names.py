@@ -1,5 +1,6 @@
 """Modules are named after their content, once."""
 
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -17,3 +18,18 @@ def test_no_two_modules_have_the_same_name() -> None:
         if not path.stem.startswith("__") and path.relative_to(ROOT).parts[0] not in NAMED_AFTER_COMMANDS
     )
     assert [name for name, count in names.items() if count > 1] == []
+
+
+def test_the_architecture_page_names_every_module_in_the_row_of_its_folder() -> None:
+    page = (ROOT.parents[1] / "docs" / "architecture.md").read_text("utf-8")
+    rows = re.findall(
+        r"^\| (`[^|]*`|top) \| (.*) \|$", page.partition("## Modules")[2].partition("| change |")[0], re.MULTILINE
+    )
+    named = {name for folders, modules in rows for name in re.findall(r"`(\w+)`", folders + modules)}
+    missing = {path.stem for path in ROOT.rglob("*.py") if not path.stem.startswith("__")} - named
+    assert missing == set()
+    for folders, modules in rows:
+        places = [ROOT / folder.replace(".", "/") for folder in re.findall(r"`([\w.]+)`", folders)] or [ROOT]
+        here = {path.stem for place in places for path in [*place.glob("*.py"), place.with_suffix(".py")]}
+        first_words = set(re.findall(r"`(\w+)`", re.sub(r"\([^)]*\)", "", modules))) - here
+        assert first_words - {"check", "info", "figures"} == set(), folders
