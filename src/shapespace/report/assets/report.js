@@ -15,7 +15,7 @@
       if (theme) window.localStorage.setItem("shapespace-theme", theme);
       else window.localStorage.removeItem("shapespace-theme");
     } catch (refused) {
-      // A page from file:// may be refused; the choice then lasts as long as the page.
+      // A page from file:// may have no storage; the choice then lasts as long as the page.
     }
   }
   function tellTheme() {
@@ -101,7 +101,7 @@
   window.addEventListener("load", offerAll);
   narrowPage.addEventListener("change", offerAll);
 
-  // Tables wider than the page say so.
+  // Tables wider than the page have a note.
   function tellWide() {
     for (const holder of document.querySelectorAll(".table")) {
       holder.classList.toggle("wide", holder.scrollWidth > holder.clientWidth + 4);
@@ -124,7 +124,7 @@
   });
   unfold();
 
-  // The navigation stays by itself; here it says which part is read.
+  // The navigation marks the part that is read.
   const links = Array.from(document.querySelectorAll("nav a"));
   function tellWhere() {
     const below = links.findIndex((link) => document.getElementById(link.hash.slice(1)).getBoundingClientRect().top > 120);

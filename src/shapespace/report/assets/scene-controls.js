@@ -36,7 +36,7 @@
         const [px, py, depth] = view.project(point);
         const reach = thing.isMarks ? 12 : 9;
         if ((px - x) ** 2 + (py - y) ** 2 > reach * reach) continue;
-        // Marks win over the surface that they stand on.
+        // Marks win over the surface below them.
         const far = distance + depth - (thing.isMarks ? 0.02 * distance : 0) + Math.hypot(px - x, py - y) * 1e-3;
         if (far < nearest) { nearest = far; best = { id: thing.id, point, vertex: v }; }
       }

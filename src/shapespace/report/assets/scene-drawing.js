@@ -5,11 +5,11 @@
   const Shapespace = window.Shapespace;
   const { FIELD } = Shapespace.sceneParts;
 
-  // Browsers refuse more than some 8 to 16 contexts, so all views share one and keep a plain canvas each.
+  // Browsers allow some 8 to 16 contexts, so all views share one and keep a plain canvas each.
   let shared;
   const views = new Set();
 
-  /** Return {canvas, context, renderer, bySoftware, lost} of the page, or null where there is no WebGL. */
+  /** Return {canvas, context, renderer, bySoftware, lost} of the page, or null without WebGL. */
   function gpu() {
     if (shared !== undefined) return shared;
     shared = null;

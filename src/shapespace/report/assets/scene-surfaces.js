@@ -11,7 +11,7 @@
 
   /** The contents of a view, by id. The view extends this class, and its `request` asks for a redraw. */
   Shapespace.sceneParts.Surfaces = class {
-    /** works: false where there is no WebGL; then all methods do nothing. */
+    /** works: false without WebGL; then all methods do nothing. */
     constructor(works) {
       this.works = works;
       this._things = new Map();
@@ -172,7 +172,7 @@
       this.request();
     }
 
-    /** Show small balls with names: [{position, label, colour}]; names are written beside them while there are few. */
+    /** Show small balls with names: [{position, label, colour}]; names are written next to them while there are few. */
     marks(id, marks) {
       if (!this.works) return;
       this.remove(id);

@@ -12,7 +12,7 @@
     lazily(element, payload, (unpacked) => {
       const { most = 8, reach = 3 } = options || {};
       const model = new Shapespace.Model(unpacked);
-      const { view, controls } = stage(element, "The shape model, as the sliders say");
+      const { view, controls } = stage(element, "The shape at the coefficients of the sliders");
       const K = Math.min(most, model.K);
       const z = new Float32Array(model.K), positions = new Float32Array(3 * model.V);
       view.setSurface("shape", { positions: model.vertices(z), faces: model.faces, colour: colours().clay });
@@ -95,7 +95,7 @@
   Shapespace.widgets.morph = (element, payload) =>
     lazily(element, payload, (unpacked) => {
       const model = new Shapespace.Model(unpacked), { low, high, weights, variable, range } = unpacked.facts;
-      const { view, controls } = stage(element, `A shape between ${low} and ${high}, as the slider says`);
+      const { view, controls } = stage(element, `A shape between ${low} and ${high}, at the value of the slider`);
       const at = new Float32Array(weights[0]), positions = new Float32Array(3 * model.V);
       let now = -1;
       /** Sets the shape at a value from -1 to 1. */

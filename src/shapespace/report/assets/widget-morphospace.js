@@ -56,7 +56,7 @@
           Object.assign(context, { font: `${font} ${style.fontFamily}`, fillStyle: colour, textAlign: align, textBaseline: "middle" });
           context.fillText(text, x, y);
         };
-        // The least round step whose labels, 52 pixels wide, stand apart.
+        // The least round step whose labels, 52 pixels wide, do not overlap.
         const power = 10 ** Math.floor(Math.log10(52 / scale)), step = [1, 2, 5, 10].map((f) => f * power).find((one) => one * scale >= 51.9);
         const label = (k) => signed(k * step, Math.max(0, -Math.floor(Math.log10(step) + 1e-9))).replace("+", "");
         for (let k = Math.ceil((left - x0) / scale / step), x; (x = x0 + k * step * scale) <= right; k++) {
@@ -239,6 +239,6 @@
       new ResizeObserver(redraw).observe(plot);
       drawPlot();
       moveTo(0, 0);
-      return { view: { works: true } }; // without WebGL too, where the pictures say so
+      return { view: { works: true } }; // without WebGL too, which the pictures state
     });
 })();

@@ -6,7 +6,7 @@
 
   window.ShapespaceTexts = {
     count,
-    offline: "The studio's server does not answer; see whether shapespace studio still runs. This page goes on when it is back.",
+    offline: "The studio's server does not answer; check that shapespace studio still runs. This page continues when it is back.",
     unreachable: "The studio's server does not answer; see whether shapespace studio still runs, then do it again.",
     unauthorised: "This page is no longer signed in; open the address that shapespace studio printed.",
     serverError: (status) => `The server answered with the error ${status}; reload the page.`,
@@ -52,7 +52,7 @@
       states: { waiting: "being checked", ready: "ready", unusable: "cannot be used" }, new: "new", training: "training",
       summary: (all, included, unusable) => `${count(all, "specimen")}, ${included} included${unusable ? `, ${unusable} cannot be used` : ""}`,
       notes: "Look at the table", classes: "Classes", noClass: "(empty)", more: (number) => `Show ${number} more`,
-      repaired: "Repaired: ", refused: "Refused: ", note: "", nothing: "No specimen matches the filter.",
+      repaired: "Repaired: ", refused: "Cannot be used: ", note: "", nothing: "No specimen matches the filter.",
     },
     uploads: {
       progress: (done, total) => `Adding file ${Math.min(done + 1, total)} of ${total}`, finished: (added) => `${count(added, "file")} added.`,

@@ -124,7 +124,7 @@
     const columns = (of) => Array.from({ length: about.modes }, (_, k) => head.indexOf(`${of}${k + 1}`));
     const at = columns(letter), other = columns(letter === "z" ? "b" : "z");
     if (named(letter) !== about.modes || at.includes(-1)) {
-      throw new Error(`${file.name} holds ${named(letter)} coefficients and ${about.model} has ${about.modes}; give a table of fits by this model.`);
+      throw new Error(`${file.name} contains ${named(letter)} coefficients and ${about.model} has ${about.modes}; give a table of fits by this model.`);
     }
     let added = 0;
     for (const line of table.slice(1)) {
@@ -134,7 +134,7 @@
       const numbers = given.map(Number);
       const values = letter === "z" ? numbers : numbers.map((value, k) => value / about.stddev[k]);
       if (!values.every(Number.isFinite)) continue;
-      // Tables with b and z tell the standard deviations of their model.
+      // Tables with b and z give the standard deviations of their model.
       const differs = letter === "z" && values.some((value, k) => {
         const b = line[other[k]] ? Number(line[other[k]]) : NaN, ours = value * about.stddev[k];
         return Math.abs(b - ours) > 1e-3 * Math.max(Math.abs(b), Math.abs(ours)) + 1e-6;

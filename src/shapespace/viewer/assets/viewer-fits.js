@@ -18,7 +18,7 @@
       h("strong", {}, STATUS[facts.status] || facts.status), h("span", {}, plainReason(facts.reason || "")), notes);
   }
 
-  /** A reason without what the heading says already. */
+  /** A reason without the words of the heading. */
   function plainReason(reason) {
     const said = "Do not trust this fit: ";
     if (!reason.startsWith(said)) return reason; // it may begin with the name of a file
@@ -89,7 +89,7 @@
     return Math.max(0, good >= 0 ? good : page.fits.findIndex((row) => row.pictured));
   }
 
-  /** Show the fits whose name, label or status holds what is typed. */
+  /** Show the fits whose name, label or status contains the typed text. */
   function filterFits() {
     const wanted = $("fit-filter").value.trim().toLowerCase();
     let left = 0;

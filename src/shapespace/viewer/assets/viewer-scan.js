@@ -73,7 +73,7 @@
     };
   }
 
-  /** The scan, and the model on its way to it. What is shown stands as the model does at its first state. */
+  /** The scan, and the model on its way to it. The view starts at the model's first state. */
   function drawStates() {
     const { about, model, own, stage } = page;
     if (page.shown !== "scan" || !own || !own.preview) return;
@@ -123,7 +123,7 @@
       else if (page.shown === "scan") page.stage.nothing(`There is no picture of ${mine.name}`);
       return;
     }
-    const start = { landmarks: "landmarks", upright: "the scan as it stands", rotations: "a search over rotations", given: "a given pose" }[told.start];
+    const start = { landmarks: "landmarks", upright: "the pose of the file", rotations: "a search over rotations", given: "a given pose" }[told.start];
     const seconds = Object.values(told.seconds || {}).reduce((sum, value) => sum + value, 0);
     $("verdict").append(h("p", { class: "hint" }, `Started from ${start || told.start}; ${mine.states.length} states in ${seconds.toFixed(1)}\u00a0s.`));
     if (!told.pictured) return;
@@ -159,7 +159,7 @@
     return mine.states.length ? `iteration ${mine.states[mine.states.length - 1].iteration}` : "waits";
   }
 
-  /** The dropped scans beside each other, where there are several. */
+  /** The dropped scans next to each other, if there are several. */
   function listScans() {
     $("own").replaceChildren();
     if (page.dropped.length < 2) return;

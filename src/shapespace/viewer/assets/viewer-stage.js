@@ -35,7 +35,7 @@
       $("pane-b").hidden = !two;
     }
 
-    /** What is seen as PNG; two views stand side by side. */
+    /** The picture as PNG; two views are side by side. */
     async picture() {
       const views = $("pane-b").hidden ? [this.a] : [this.a, this.b];
       const blobs = await Promise.all(views.map((view) => view.png()));
@@ -84,7 +84,7 @@
       this.holds = null;
     }
 
-    /** Show no surface, and say why. */
+    /** Show no surface, with the reason. */
     nothing(text) {
       this.clear();
       this.split(false);
