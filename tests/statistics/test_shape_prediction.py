@@ -232,7 +232,7 @@ def test_the_slider_of_the_report_passes_through_the_mean_shapes() -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"along": "sex"}, "holds classes, and shapes are predicted along a number"),
+        ({"along": "sex"}, "contains classes, and shapes are predicted along a number"),
         ({"along": "same"}, "is 3 for all 30 shapes, so nothing changes along it"),
         ({"along": "weight"}, "no column"),
         ({"along": "gaps"}, "gaps of 1 of 30 shapes is missing"),

@@ -16,8 +16,9 @@ class ShapeTest:
 
     Args:
         name: word after `shapespace test`.
-        summary: what it does, without a capital and a full stop.
-        function: in `statistics.shape_tests`, with its module; it takes a cohort and the options by name.
+        summary: description of the test, without a capital and a full stop.
+        function: name of the function in `statistics.shape_tests`, with its module; it takes a cohort and the options
+            by name.
         statistics: what is computed, in words.
         permuted: what is permuted, as `TestScheme.unit`.
         resampling: how p values are computed.
