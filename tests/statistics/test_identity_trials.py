@@ -139,7 +139,7 @@ def test_missing_cells_of_the_columns_of_expressions_are_counted(options):
         trial_of(shapes, replace(FEW, **options))
     if "train" not in options:  # which would be learned from people who are tested
         trial = trial_of(shapes, replace(FEW, drop_missing=True, **options))
-        assert len(trial.cohort) == 35 and any("1 of 36 shapes are left out" in note for note in trial.notes)
+        assert len(trial.cohort) == 35 and any("1 of 36 shapes are excluded" in note for note in trial.notes)
 
 
 def test_scans_of_nobody_are_refused_or_left_out():

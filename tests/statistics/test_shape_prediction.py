@@ -260,7 +260,7 @@ def test_missing_numbers_are_left_out_on_demand() -> None:
     made = study()
     ages = ("", *made.table.texts("age")[1:])
     found = predict_shapes(with_column(made, "age", ages), "age", permutations=0, drop_missing=True)
-    assert found.n_subjects == 29 and any("1 of 30 shapes are left out" in note for note in found.cohort.notes)
+    assert found.n_subjects == 29 and any("1 of 30 shapes are excluded" in note for note in found.cohort.notes)
 
 
 @pytest.mark.parametrize(("n", "curve", "least"), [(9, "linear", 10), (19, "spline", 20)])

@@ -49,10 +49,10 @@ def find_orientation(
     """Return the orientation of a file, or of orientation.json and links.csv in the first folders that have them.
 
     Args:
-        path: the file; None searches the folders.
-        folders: of the shapes.
+        path: file of the orientation; None searches the folders.
+        folders: folders of the shapes.
         landmarks: names of the landmarks, which links.csv may have; None for numbers alone.
-        curve_links: links where the files have none.
+        curve_links: links that are used if the files have none.
 
     Raises:
         FileError: a file cannot be read.

@@ -1,7 +1,8 @@
 """Raw scans simulated from a known surface: new triangles, new pose and scale, noise, holes, hair and collar.
 
-What a real scanner does to a face, with the truth kept: where each vertex of the model truly lies in the scan. The
-frame of the given mesh must have y up and the face looking along +z, as all faces of this package have, in mm.
+The simulation reproduces the effects of a real scanner on a face and keeps the truth: the true position of each vertex
+of the model in the scan. The frame of the given mesh must have y up and the face looking along +z, as all faces of this
+package have, in mm.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from shapespace.reprs import short_repr
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity, generator_of, read_only, require
 
 PLAIN_TRIANGLES = 20_000
-"""Of a plain scan."""
+"""Number of triangles of a plain scan."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +32,8 @@ class Hole:
     """A ball cut out of the scan.
 
     Args:
-        radius_mm: of the ball, in the model's millimetres.
-        center: (3,) in the model's frame; None takes a random vertex of the surface.
+        radius_mm: radius of the ball, in the model's millimetres.
+        center: (3,) centre in the model's frame; None for a random vertex of the surface.
     """
 
     radius_mm: float
@@ -57,11 +58,11 @@ class SimulatedScan:
     """A simulated raw scan with the truth.
 
     Args:
-        scan: the surface as a scanner would give it: its own triangles and frame, no landmarks.
+        scan: surface as a scanner would return it: its own triangles and frame, no landmarks.
         truth_vertices: (V, 3) float64, the vertices of the model's mesh, in its order, in the frame of the scan.
         truth_landmarks: name -> (3,), the landmarks of the model's mesh in the frame of the scan.
-        T_scan_model: from the model's frame to the scan's.
-        on_surface: (S,) bool, which vertices of the scan belong to the true surface, and are no outliers.
+        T_scan_model: transformation from the model's frame to the scan's.
+        on_surface: (S,) bool, whether each vertex of the scan belongs to the true surface, and is no outlier.
 
     Example:
         >>> simulated = ss.datasets.simulate_scan(meshes[0], 0, triangles=2000)
@@ -124,17 +125,17 @@ def simulate_scan(
 
     Args:
         mesh: the true surface, in mm, y up and facing +z.
-        rng: generator or seed, from which every random choice comes.
-        triangles: of the re-triangulated surface, before anything is cut away or added.
+        rng: generator or seed, from which every random choice is made.
+        triangles: number of triangles of the re-triangulated surface, before anything is cut away or added.
         noise_mm: standard deviation of the noise along the normals, in mm of the model's frame.
         T_scan_model: pose and scale of the scan; None leaves it in the model's frame.
         holes: balls to cut out.
         crop: planes to cut with.
-        hair: to put on, or None.
-        collar: to put on, or None.
-        outlier_fraction: share of the vertices thrown 3 to 15 mm off the surface, either way.
-        split: as in `retriangulate`.
-        name: of the scan.
+        hair: hair to add; None for none.
+        collar: collar to add; None for none.
+        outlier_fraction: share of the vertices moved 3 to 15 mm off the surface, to either side.
+        split: whether all triangles are split first, see `retriangulate`.
+        name: name of the scan.
 
     Raises:
         InputError: an option out of range, or holes and cuts that leave nothing.
@@ -293,8 +294,8 @@ class Collar:
     """A collar: a bumpy band around the neck, below the surface and overlapping its lower border.
 
     Args:
-        height_mm: of the band.
-        overlap_mm: how far it comes up over the lower border of the surface.
+        height_mm: height of the band.
+        overlap_mm: overlap of the band with the lower border of the surface.
         spacing_mm: length of its edges.
     """
 
