@@ -112,10 +112,10 @@ def _one_position(shapes: FloatArray, mean: FloatArray, analysed: BoolArray, fac
     """Return one position (M, 3) per excluded vertex: the mean of the observed positions, or a harmonic interpolation.
 
     Args:
-        shapes: (N, V, 3) shapes as given, aligned; NaN where not observed.
-        mean: (A, 3) of the analysed vertices.
-        analysed: (V,).
-        faces: (F, 3).
+        shapes: (N, V, 3) shapes as given, aligned; NaN if not observed.
+        mean: (A, 3) mean of the analysed vertices.
+        analysed: (V,) whether each vertex is analysed.
+        faces: (F, 3) triangles; None for points.
     """
     is_complete: BoolArray = np.logical_and.reduce(np.isfinite(shapes), axis=2)
     count = is_complete.sum(axis=0)

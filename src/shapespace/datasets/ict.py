@@ -256,8 +256,8 @@ def write_people(
         expressions: names of `EXPRESSIONS` or of the published expressions, at full intensity.
         raw: whether to write raw scans (`plain_scan`) instead of surfaces in correspondence; there is then no
             landmarks.csv, since the vertices do not correspond.
-        faces: the model; None loads it.
-        progress: called with (done, total) after each file.
+        faces: ICT face model; None loads it.
+        progress: function called with (done, total) after each file.
 
     Raises:
         InputError: no people or no expressions, or an unknown expression or area.

@@ -136,14 +136,14 @@ def write_organs(
     """Write organ_000.ply and so on as raw surfaces, or organ_000.nii.gz as label volumes; those are of one organ.
 
     Args:
-        folder: created when missing.
-        count: 1 to 10,000.
-        seed: a number of 0 or more.
-        volumes: write label volumes.
-        progress: called after each.
+        folder: output folder; created if it does not exist.
+        count: number of organs, 1 to 10,000.
+        seed: seed, 0 or more.
+        volumes: whether to write label volumes.
+        progress: function called after each organ.
 
     Raises:
-        InputError: a number that cannot be.
+        InputError: a number out of range.
         ShapespaceError: volumes, without the extra `volumes`.
         FileError: the folder cannot be written.
     """

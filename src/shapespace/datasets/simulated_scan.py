@@ -88,10 +88,10 @@ def random_similarity(
     """Return a random similarity about the origin.
 
     Args:
-        rng: draws it.
-        max_angle_deg: the angle is uniform in [0, max] about a random axis.
-        scale_range: least and greatest scale, drawn evenly in its logarithm.
-        translation_mm: each coordinate is uniform in [-this, this].
+        rng: random generator of the transformation.
+        max_angle_deg: largest angle about a random axis, uniform in [0, max], degrees.
+        scale_range: smallest and largest scale, drawn uniformly in its logarithm.
+        translation_mm: largest absolute value of each coordinate of the translation, uniform, mm.
 
     Raises:
         InputError: a scale that is not positive.
@@ -204,9 +204,10 @@ def retriangulate(
 
     Args:
         mesh: the surface.
-        rng: every random choice comes from it.
-        triangles: about how many there shall be.
-        split: False splits only as far as it must, which for fewer triangles than the mesh has is four times faster.
+        rng: source of all random choices.
+        triangles: approximate number of triangles of the result.
+        split: whether to split all triangles; False splits only as far as necessary, which is four times faster if the
+            result has fewer triangles than the mesh.
 
     Raises:
         MeshError: `mesh` has no faces, edges that more than two triangles share, or neighbours of opposite winding.
@@ -273,9 +274,9 @@ class Hair:
     """Hair as a 3dMD scanner sees it: a bumpy sheet over the scalp, tufts over the forehead, floating shreds.
 
     Args:
-        fringe_mm: how far down over the upper border of the surface the sheet comes.
-        thickness_mm: least and greatest distance of the sheet from the head.
-        sideburns_mm: how much lower the sheet comes at the temples.
+        fringe_mm: overlap of the sheet with the upper border of the surface.
+        thickness_mm: smallest and largest distance of the sheet from the head.
+        sideburns_mm: additional overlap of the sheet at the temples.
         tufts: number of locks that hang from the sheet.
         shreds: number of small patches that float free.
         spacing_mm: length of the edges of the sheet.

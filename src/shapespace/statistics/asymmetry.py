@@ -124,7 +124,7 @@ class AsymmetryResult(AnalysisResult):
         size_anova: rows of the ANOVA of the centroid sizes of separate sides, with the degrees of freedom of
             `observations`.
         degrees_of_freedom: kind of the degrees of freedom of the ANOVA of shape.
-        imputations: those that p values combine; None without samples of completed shapes.
+        imputations: imputations that p values combine; None without samples of completed shapes.
 
     Example:
         >>> surfaces = ss.Cohort.of_shapes([mesh.vertices for mesh in meshes], {}, faces=meshes[0].faces)

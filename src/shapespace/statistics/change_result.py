@@ -218,7 +218,7 @@ class ChangeResult(AnalysisResult):
         after: (V, 3) the mean of the first visits moved by the mean change, mm.
         landmarks: landmarks on the surfaces.
         regions: names of the parts with volumes: first the complete surface, then the regions.
-        time_unit: unit of changes, as in `mm per year`; empty if times are words.
+        time_unit: unit of time for rates, such as `year`; empty if times are words.
         is_closed: whether the surface is closed.
         is_model_only: whether the surfaces contain only variation of the model of the fits.
         blank: (V,) bool, where maps are blank because too few subjects observe the vertex; None if nowhere.

@@ -211,9 +211,9 @@ class ShapeEffect:
         distance_mm: Procrustes distance, the root of the squared changes summed over vertices.
         rms_mm: root of the squared changes averaged over vertices.
         f: squared distance by its variance.
-        z: F in standard deviations above the mean of its arrangements, after `CompareConfig.effect_size`.
+        z: F in standard deviations above the mean of its arrangements, after the transformation `effect_size`.
         p: share of arrangements with an F as large.
-        p_family: the same by the largest F of all pairs of classes of this variable.
+        p_family: share of arrangements whose largest F of all pairs of classes of this variable is as large.
         map: tests of the effect at each vertex; None if not requested.
         exploratory: whether no term of this effect is significant; its map is then exploratory.
     """
@@ -271,13 +271,13 @@ class CompareResult(AnalysisResult):
         design: columns of the model.
         config: options of the comparison.
         tests: tests of the terms.
-        strata: Residual degrees of freedom and sums of squares of each stratum.
+        strata: residual degrees of freedom and sums of squares of each stratum.
         effects: effects of the variables, and of pairs of variables that interact.
         angles: angles between effects.
         n_subjects: number of subjects; number of shapes if all are independent.
         dispersions: tests of equal dispersion of the classes of each variable between subjects.
         methods: sample sizes, tests and assumptions.
-        repeated_measures: how several shapes of a subject enter the tests; None if all shapes are independent.
+        repeated_measures: use of several shapes of a subject in the tests; None if all shapes are independent.
         imputations: imputations that p values combine; None without samples of completed shapes.
 
     Example:
@@ -813,7 +813,7 @@ def _within_ends(within: WithinSubjects, variable: Variable, low: str | float, h
 def _within_interaction(
     within: WithinSubjects, variable: Variable, other: Variable, words: tuple[str, str]
 ) -> _Contrast:
-    """Return the contrast of two variables of which one or both differ within subjects."""
+    """Return the contrast of two variables, if one or both differ within subjects."""
     both = frozenset({variable.column, other.column})
     (low, high), (first, second) = _pairs(variable)[0], _pairs(other)[0]
     name = f"{variable.name}:{other.name}"

@@ -18,7 +18,7 @@ from shapespace.types import FloatArray
 
 IndexArray = npt.NDArray[np.intp]
 PENALTIES = tuple(10.0 ** (0.5 * k) for k in range(-10, 1))
-"""Penalties of ridge regression on coefficients, times the largest squared singular value."""
+"""Penalties of ridge regression on coefficients, as shares of the largest squared singular value."""
 MODES = (1, 2, 3, 5, 8, 12, 20, 30, 50)
 """Numbers of leading principal components in a regression on whitened coefficients."""
 _NOTHING = 1e-10  # share of the first singular value; below is rounding

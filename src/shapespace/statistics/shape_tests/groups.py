@@ -110,7 +110,7 @@ def compare_disparity(
 def _make_refit(q: FloatArray, rows_of_errors: FloatArray, weights: FloatArray) -> Callable[[Orders], FloatArray]:
     """Return a function of orders (b, N) that permutes errors, fits the model again and sums the squared residuals.
 
-    The sums have the degrees of freedom of the observed sums, so that variances of small groups vary equally.
+    The sums have the degrees of freedom of the observed sums, so that variances of small groups vary as observed ones do.
 
     Args:
         q: (N, m) orthonormal columns of the model.
@@ -272,8 +272,8 @@ def assess_equivalence(
     Args:
         cohort: the shapes.
         group: columns whose classes, or combinations of classes, are the groups.
-        margin: Procrustes distance, in the unit of the data, from which on means are not equivalent.
-        margin_sd: the same in standard deviations within groups, the root of the pooled Procrustes variance.
+        margin: smallest Procrustes distance, in the unit of the data, of means that are not equivalent.
+        margin_sd: margin in standard deviations within groups, the root of the pooled Procrustes variance.
         permutations: number of bootstrap samples, including the observed data.
         seed: seed of the bootstrap samples.
         drop_missing: exclude shapes with missing values in the table (default: an error).

@@ -35,8 +35,8 @@ class Ordination:
     """Shapes as scores on the axes of an ordination.
 
     Args:
-        method: how the axes were chosen.
-        cohort: the shapes that were used.
+        method: method by which the axes were computed.
+        cohort: cohort of the shapes that were used.
         axes: (A, K) scores are (coefficients - centre) axes^T.
         shape_axes: (A, K) change of the coefficients per unit of score; equal to `axes` if these are orthonormal.
         centre: (K,) coefficients of the shape at the origin.

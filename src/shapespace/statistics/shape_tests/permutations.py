@@ -47,7 +47,7 @@ def permuted(
     n: int, permutations: int, seed: int, statistic: Callable[[Orders], FloatArray],
     progress: Progress | None,
 ) -> FloatArray:  # fmt: skip
-    """Return the (P, ...) statistics of all `orders`, of which `statistic` takes a batch."""
+    """Return the (P, ...) statistics of all `orders`; `statistic` is called with batches of orders."""
     step, batches = StepCounter(permutations, progress), list[FloatArray]()
     for _, rows in orders(n, permutations, seed):
         batches.append(statistic(rows))
@@ -88,11 +88,11 @@ class Groups:
         return [f"{self.names[a]} – {self.names[b]}" for a, b in self.pairs]
 
     def labels(self, rows: Orders) -> FloatArray:
-        """Return (b, G, N) 1 where a shape is of a group, of which orders (b, N) permute the members."""
+        """Return (b, G, N) labels, 1 for the members of each group, after permutation of the members by orders (b, N)."""
         return (self.codes[rows][:, None, :] == np.arange(len(self.names))[:, None]).astype(np.float64)
 
     def sums(self, values: FloatArray, rows: Orders) -> FloatArray:
-        """Return the (b, G, K) sums of values (N, K) in each group, of which orders (b, N) permute the members."""
+        """Return the (b, G, K) sums of values (N, K) in each group, after permutation of the members by orders (b, N)."""
         return (self.labels(rows).reshape(-1, len(values)) @ values).reshape(len(rows), len(self.names), -1)
 
     def residuals(self, values: FloatArray) -> FloatArray:
