@@ -92,7 +92,7 @@ def _size_cells(record: FitRecord) -> dict[str, Any]:
 
 
 def _moved_cells(record: FitRecord) -> dict[str, float]:
-    """Return the RMS displacement of a vertex by each mode, and by all together, mm of the scan; b is a norm over all."""
+    """Return the RMS displacement of a vertex by each mode and by all modes, mm of the scan; b is a norm over all."""
     if not record.n_vertices or record.T_scan_model is None or record.mm_per_scan_unit is None:
         return {}
     scan_mm_per_model_mm = record.T_scan_model.scale * record.mm_per_scan_unit

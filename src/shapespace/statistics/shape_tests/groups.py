@@ -110,7 +110,7 @@ def compare_disparity(
 def _make_refit(q: FloatArray, rows_of_errors: FloatArray, weights: FloatArray) -> Callable[[Orders], FloatArray]:
     """Return a function of orders (b, N) that permutes errors, fits the model again and sums the squared residuals.
 
-    The sums have the degrees of freedom of the observed sums, so that variances of small groups vary as observed ones do.
+    The sums have the degrees of freedom of the observed sums, so that variances of small groups vary as observed.
 
     Args:
         q: (N, m) orthonormal columns of the model.

@@ -88,11 +88,11 @@ class Groups:
         return [f"{self.names[a]} – {self.names[b]}" for a, b in self.pairs]
 
     def labels(self, rows: Orders) -> FloatArray:
-        """Return (b, G, N) labels, 1 for the members of each group, after permutation of the members by orders (b, N)."""
+        """Return (b, G, N) labels, 1 for the members of each group, permuted by orders (b, N)."""
         return (self.codes[rows][:, None, :] == np.arange(len(self.names))[:, None]).astype(np.float64)
 
     def sums(self, values: FloatArray, rows: Orders) -> FloatArray:
-        """Return the (b, G, K) sums of values (N, K) in each group, after permutation of the members by orders (b, N)."""
+        """Return the (b, G, K) sums of values (N, K) in each group, with members permuted by orders (b, N)."""
         return (self.labels(rows).reshape(-1, len(values)) @ values).reshape(len(rows), len(self.names), -1)
 
     def residuals(self, values: FloatArray) -> FloatArray:
