@@ -157,7 +157,7 @@ def test_bad_input_gives_one_sentence(run: Run, classifier: Path, train: Path, n
     (tmp_path / "people.csv").write_text("file,subject,foo\np0_smile,p0,smile\n")
     asked = [
         (("train", tmp_path / "absent", *labels, *out), "no such file"),
-        (("train", tmp_path / "empty", *labels, *out), "contains no results"),
+        (("train", tmp_path / "empty", *labels, *out), "holds no results"),
         (("train", train, *labels, "-o", tmp_path / "x.pkl"), "ends in .skops"),
         (("train", train, *labels, *out, "--classifier", "forest"), "no classifier 'forest'"),
         (("train", train, *labels, *out, "--modes", 9), "There are 4 coefficients"),
