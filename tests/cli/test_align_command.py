@@ -133,7 +133,7 @@ def test_sides_that_are_mirror_images_are_reflected_on_request(run: Run, folder:
         ),
         (None, ("--reflect", "side"), "write COLUMN=VALUE"),
         (None, ("--reflect", "side=left"), "has no column 'side'"),
-        (None, ("--table", "other.csv"), "holds no specimen of other.csv (rows such as x; specimens "),
+        (None, ("--table", "other.csv"), "contains no specimen of other.csv (rows such as x; specimens "),
         (None, ("--sliders", "bad.csv"), "the row '1, 10, 3'"),
         (None, ("--separate", "structures.csv"), "landmark '2' has no structure"),
         (None, ("--separate", "other.csv"), "has no columns landmark and structure"),

@@ -120,7 +120,7 @@ def test_mean_shapes_of_landmarks_have_intervals_along_the_axes(run: Run, folder
         (["regress", "people.csv", "--target", "group"], "'group' is 'case' at s00, which is no number"),
         (["regress", "people.csv", "--target", "age", "--predict", "people.csv"], "were learned from too"),
         (["regress", "people.csv", "--target", "age", "--set", "level=2"], "level of intervals"),
-        (["regress", "people.csv", "--along", "group"], "holds classes"),
+        (["regress", "people.csv", "--along", "group"], "contains classes"),
         (["regress", "people.csv", "--along", "age", "--at", "500"], "shapes are not predicted beyond, at 500"),
         (["regress", "people.csv", "--along", "age", "--set", "curve=spline"], "12 subjects are too few"),
         (["regress", "people.csv", "--along", "age", "--covariates", "group", "--set", "hold=group=x"], "held at 'x'"),

@@ -67,7 +67,7 @@ def test_a_table_of_meshes_becomes_an_answer_with_tables_in_millimetres(visits, 
 
 
 def test_what_cannot_be_used_is_said_in_a_sentence(visits, ask) -> None:
-    assert "'visit' holds words (after, before)" in ask().sentence()
+    assert "'visit' contains words (after, before)" in ask().sentence()
     assert "not in the order before,later" in ask("--order", "before,later").sentence()
     assert "no stable region 'brow'" in ask("--order", "before,after", "--stable", "brow").sentence()
     (visits / "far.csv").write_text("name,vertex\nnose,5000\n")
@@ -76,4 +76,4 @@ def test_what_cannot_be_used_is_said_in_a_sentence(visits, ask) -> None:
     (visits / "gap.csv").write_text(text.replace("s0_before_2.ply,s0,before", "s0_before_2.ply,s0,"))
     assert "missing=drop" in ask("--order", "before,after", table="gap.csv").sentence()
     dropped = ask("--order", "before,after", "--stable", "all", "--set", "missing=drop", "--quiet", table="gap.csv")
-    assert dropped.code == 0 and "1 of 7 shapes are left out" in dropped.err
+    assert dropped.code == 0 and "1 of 7 shapes are excluded" in dropped.err

@@ -42,7 +42,7 @@ def test_a_table_and_fits_end_in_an_answer_and_a_report(command: str, folder: Pa
     assert outcome.code == 0
     assert outcome.facts["question"] == f"recognise {command}"
     assert outcome.facts["settings"]["gallery"] == "expression=neutral"
-    assert "1 of 27 fits are left out, which are doubtful (p26)." in outcome.err
+    assert "1 of 27 fits are excluded, which are doubtful (p26)." in outcome.err
     methods = (tmp_path / "methods.txt").read_text("utf-8")
     assert "compared by PLDA score, cosine" in methods and "Ioffe S. (2006)" in methods
     assert (tmp_path / "analysis.json").is_file() and (tmp_path / "figures.csv").is_file()

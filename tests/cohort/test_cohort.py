@@ -196,7 +196,7 @@ def test_a_scan_that_was_copied_is_refused_by_both_its_names() -> None:
     fitted = fitted_of(model())
     twice = np.array(fitted.b)
     twice[6] = twice[2]
-    with pytest.raises(InputError, match="scan2 and scan6 are the same shape but for rounding"):
+    with pytest.raises(InputError, match="scan2 and scan6 are the same shape up to rounding"):
         Cohort.of_fits(replace(fitted, b=twice), *blank(COUNT), np.full(COUNT, np.nan))
 
 
@@ -214,7 +214,7 @@ def test_who_lacks_a_value_is_refused_by_name_or_left_out_and_counted() -> None:
     with pytest.raises(InputError, match=r"age of 2 of 8 shapes is missing \(scan1, scan5\).*--set missing=drop"):
         cohort.complete(["age"])
     kept = cohort.complete(["age"], drop_missing=True)
-    assert len(kept) == 6 and "2 of 8 shapes are left out" in kept.notes[-1] and "scan1, scan5" in kept.notes[-1]
+    assert len(kept) == 6 and "2 of 8 shapes are excluded" in kept.notes[-1] and "scan1, scan5" in kept.notes[-1]
     assert kept.complete(["age"]) is kept
     with pytest.raises(InputError, match="no shape has all"):
         cohort.complete(["none"], drop_missing=True)
@@ -228,7 +228,7 @@ def test_a_folder_of_fits_is_a_cohort_without_doubtful_and_failed_ones(fits: Pat
     assert cohort.names == ("scan0", "scan1", "scan2", "scan5", "scan6", "scan8", "scan9")
     assert cohort.table.texts("sex")[:3] == ("f", "m", "f") and list(cohort.table.numbers("age"))[-1] == 29
     told = " ".join(cohort.notes)
-    assert "2 of 10 fits are left out, which are doubtful (scan3, scan4)" in told and "1 of 10" in told
+    assert "2 of 10 fits are excluded, which are doubtful (scan3, scan4)" in told and "1 of 10" in told
     assert cohort.fitted is not None and set(cohort.fitted.status) == {"converged"}
     with_doubtful = read_cohort(fits, CohortConfig(doubtful=True))
     assert len(with_doubtful) == 9 and "doubtful" not in " ".join(with_doubtful.notes)
@@ -247,7 +247,7 @@ def test_surfaces_of_fits_are_the_same_shapes_in_another_frame(fits: Path) -> No
     # The surfaces are in float32, and aligned anew.
     assert np.abs(pairwise(fitted.coefficients) - pairwise(plain.coefficients)).max() < 0.3
     assert steps[-1] == (7, 7) and fitted.fitted is not None and fitted.landmarks == dict(model().landmarks)
-    with pytest.raises(InputError, match=r"holds no dense surface of scan0.*with --dense"):
+    with pytest.raises(InputError, match=r"contains no dense surface of scan0.*with --dense"):
         read_cohort(fits, CohortConfig(surfaces="dense"))
 
 
@@ -284,7 +284,7 @@ def test_a_table_names_fits_by_their_scans_and_tells_whom_it_lacks(fits: Path, t
     assert cohort.names == ("scan0", "scan9") and list(cohort.table.numbers("age")) == [0, 9]
     told = " ".join(cohort.notes)
     assert "1 of 4 rows" in told and "stranger" in told
-    assert "1 of 3 fits are left out, which are doubtful (scan3)" in told
+    assert "1 of 3 fits are excluded, which are doubtful (scan3)" in told
     assert "7 of 10 specimens" in told and "have no row" in told
 
 
@@ -340,13 +340,13 @@ def test_too_few_fits_say_why(fits: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"1 of its fits can be used.*doubtful \(scan3, scan4\)"):
         read_cohort(tmp_path / "data.csv", CohortConfig(shapes=fits))
     write_text(tmp_path / "data.csv", "file\nx\ny\n")
-    with pytest.raises(InputError, match=r"holds no specimen of .*such as x, y; specimens scan0, scan1"):
+    with pytest.raises(InputError, match=r"contains no specimen of .*such as x, y; specimens scan0, scan1"):
         read_cohort(tmp_path / "data.csv", CohortConfig(shapes=fits))
 
 
 def test_what_is_no_folder_or_holds_nothing_is_refused(fits: Path, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="holds neither results of fits nor landmark files"):
+    with pytest.raises(InputError, match="contains neither results of fits nor landmark files"):
         read_cohort(tmp_path / "empty")
     write_text(tmp_path / "data.csv", "file\na\n")
     with pytest.raises(InputError, match="is neither a folder nor a landmark file"):
@@ -494,7 +494,7 @@ def test_a_mesh_that_was_copied_is_refused(meshes: Callable[..., Path], tmp_path
     first = training_meshes(5, vertices=80)[0]
     elsewhere = similarity(3, degrees=70.0, scale=1.0)
     table = meshes(change=lambda k, mesh: first.with_vertices(elsewhere.apply(first.vertices)) if k == 4 else mesh)
-    with pytest.raises(InputError, match="m0 and m4 are the same shape but for rounding"):
+    with pytest.raises(InputError, match="m0 and m4 are the same shape up to rounding"):
         read_cohort(table, CohortConfig(shapes=tmp_path / "meshes"))
 
 

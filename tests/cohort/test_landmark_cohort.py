@@ -101,7 +101,7 @@ def test_rows_without_landmarks_and_landmarks_without_rows_are_left_out_with_not
     cohort = read_cohort(table, CohortConfig(shapes=file))
     assert cohort.names == NAMES[:5]
     assert "1 of 6 rows" in cohort.notes[0] and "7 of 12 specimens" in cohort.notes[1]
-    with pytest.raises(InputError, match="holds no specimen of"):
+    with pytest.raises(InputError, match="contains no specimen of"):
         read_cohort(write_table(tmp_path / "none.csv", ("a", "b")), CohortConfig(shapes=file))
     with pytest.raises(InputError, match="1 specimen can be used, and 2 are needed"):
         read_cohort(write_table(tmp_path / "one.csv", NAMES[:1]), CohortConfig(shapes=file))

@@ -108,15 +108,17 @@ def test_two_rows_of_one_specimen_are_refused_and_both_named(rows: str, told: st
 def test_rows_without_a_specimen_and_specimens_without_a_row_are_counted() -> None:
     table = Table({}, tuple("abcxyzw"), "data.csv")
     assert match_rows(table, [[name] for name in "dcbaq"], "scans")[1] == [
-        "4 of 7 rows of data.csv have no specimen in scans and are left out (x, y, z and 1 more).",
+        "4 of 7 rows of data.csv have no specimen in scans and are excluded (x, y, z and 1 more).",
         "2 of 5 specimens in scans have no row in data.csv (d, q).",
     ]
     assert match_rows(table.take([0, 3]), [["a"], ["b"]], "scans")[1] == [
-        "1 of 2 rows of data.csv has no specimen in scans and is left out (x).",
+        "1 of 2 rows of data.csv has no specimen in scans and is excluded (x).",
         "1 of 2 specimens in scans has no row in data.csv (b).",
     ]
     assert match_rows(table.take([0]), [["a"]], "scans")[1] == []
-    with pytest.raises(InputError, match=r"scans holds no specimen of data.csv \(rows such as x; specimens a\); give"):
+    with pytest.raises(
+        InputError, match=r"scans contains no specimen of data.csv \(rows such as x; specimens a\); give"
+    ):
         match_rows(table.take([3]), [["a"]], "scans")
 
 
@@ -265,7 +267,7 @@ def test_many_classes_are_counted_and_not_listed() -> None:
 def test_groups_coded_as_two_numbers_are_counted() -> None:
     assert notes_on_classes("sex", ("0", *"11111", "")) == [
         "Shapes in each class of sex: 1 5, 0 1.",
-        "sex has 1 class with one shape ('0'); check the spelling, or leave these shapes out.",
+        "sex has 1 class with one shape ('0'); check the spelling, or exclude these shapes.",
     ]
     assert not notes_on_classes("age", ("20", "21", "21", "22"))
 

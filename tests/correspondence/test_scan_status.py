@@ -101,7 +101,7 @@ def test_build_leaves_doubtful_surfaces_out_with_a_note_and_includes_them_on_req
         assert (record["status"] == "doubtful") == (scan.name in doubtful) == (record["probability"] < DOUBTED)
         assert (f"{scan.name} is doubtful: {record['doubt']}" in output.err + output.out) == (scan.name in doubtful)
     assert main(["build", same, "-o", str(tmp_path / "m.h5"), "--quiet"]) == 0
-    assert f"{len(doubtful)} of 8 surfaces are doubtful and left out ({doubtful[0]}" in capsys.readouterr().err
+    assert f"{len(doubtful)} of 8 surfaces are doubtful and excluded ({doubtful[0]}" in capsys.readouterr().err
     assert ss.ShapeModel.load(tmp_path / "m.h5").n_training == 8 - len(doubtful)
     assert main(["build", same, "-o", str(tmp_path / "all.h5"), "--quiet", "--with-doubtful"]) == 0
     assert ss.ShapeModel.load(tmp_path / "all.h5").n_training == 8

@@ -94,8 +94,8 @@ def test_names_that_say_nothing_known_are_reported(tmp_path: Path, name: str):
     put(tmp_path, f"sub/{name}.wrl")
     assert "no labelled scans" in refusal(tmp_path)
     put(tmp_path, "F0009_NE00WH_F3D.wrl")
-    assert left(tmp_path) == {f"sub/{name}.wrl": "the name says nothing known"}
-    assert f"the name says nothing known: sub/{name}.wrl." in scan_set(tmp_path).summary()
+    assert left(tmp_path) == {f"sub/{name}.wrl": "a name of unknown form"}
+    assert f"a name of unknown form: sub/{name}.wrl." in scan_set(tmp_path).summary()
 
 
 def test_the_same_scan_in_two_folders_counts_once_and_is_reported(tmp_path: Path):
@@ -158,8 +158,8 @@ def test_only_neutral_and_expressions_unless_others_are_asked_for(bosphorus: Pat
     assert len(find_scans(bosphorus)) == 9
     lines = scan_set(bosphorus).summary().splitlines()
     assert lines[0].startswith("Bosphorus: 9 scans of 1 subject (neutral 2, anger 1, disgust 1, fear 1, smile 2,")
-    assert "Left out, not asked for (occlusion): bs000/bs000_O_EYE_0.bnt, bs000/bs000_O_GLASSES_0.bnt." in lines
-    units = next(line for line in lines if line.startswith("Left out, not asked for (action unit): "))
+    assert "Excluded, not asked for (occlusion): bs000/bs000_O_EYE_0.bnt, bs000/bs000_O_GLASSES_0.bnt." in lines
+    units = next(line for line in lines if line.startswith("Excluded, not asked for (action unit): "))
     assert units.count("bs000/bs000_") == 3 and units.endswith(" and 1 more.")
     assert {scan.kind for scan in find_scans(bosphorus, ["rotation"])} == {"rotation"}
 

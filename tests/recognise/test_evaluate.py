@@ -286,7 +286,7 @@ def test_what_cannot_be_evaluated_is_refused():
         fixed_predictions(folds_of(z, ["a"] * len(z), subjects, 2), "lda")
     with pytest.raises(InputError, match="no point to show"):
         learning_curve(folds, subject_counts=(50,))
-    with pytest.raises(InputError, match="none of the classes"):
+    with pytest.raises(InputError, match="not among the classes"):
         fit_temperature(["a", "b"], np.full((2, 2), 0.5), ("a", "c"))
     with pytest.raises(InputError, match="decision map"):
         decision_map(np.zeros((5, 3, 2)), np.ones(2), np.zeros((4, 3)), ["a"] * 4)

@@ -87,7 +87,7 @@ def test_each_scan_has_its_row_and_none_is_guessed():
     assert first_neutral.neutral and first_neutral.prediction == ""
     assert lost.prediction == "" and "no usable neutral face of p1" in lost.reason
     assert bad_neutral.neutral and bad_neutral.prediction == "" and "doubtful" in bad_neutral.reason
-    assert nameless.prediction == "" and "do not say whom" in nameless.reason
+    assert nameless.prediction == "" and "do not name this scan" in nameless.reason
 
 
 def test_below_the_confidence_the_answer_is_unsure_and_says_why():
@@ -223,12 +223,12 @@ def test_the_table_gives_the_same_scans_as_the_records(tmp_path):
     [
         ("", "is no table of coefficients"),
         ("a,b\n1,2\n", "is no table of coefficients"),
-        ("scan,status,reason,z1\nx,converged,,1\n", "does not say of which model"),
+        ("scan,status,reason,z1\nx,converged,,1\n", "does not state the model"),
         ("scan,status,reason,z1,model_hash\n", "has no rows"),
         ("scan,status,reason,z1,model_hash\nx,converged,,one,h\n", "row 1: a coefficient is not a number"),
         ("scan,status,reason,z1,model_hash\nx,converged,,nan,h\n", "not finite"),
         ("scan,status,reason,z1,model_hash\nx,good,,1,h\n", "status 'good'"),
-        ("scan,status,reason,z1,model_hash\nx,failed,,,\n", "does not say of which model"),
+        ("scan,status,reason,z1,model_hash\nx,failed,,,\n", "does not state the model"),
         ('scan,status,reason,z1,model_hash\n"x', "is not a CSV table"),
     ],
 )
@@ -259,7 +259,7 @@ def test_labels_are_found_by_the_file_of_the_scan_and_by_the_name_of_the_fit():
         scans, Labels(table, (Label("smile", None, "Anna"), Label("", None, "Ben"), Label("x"))), "fits"
     )
     assert notes == [
-        "1 of 3 rows of l.csv has no specimen in fits and is left out (dora).",
+        "1 of 3 rows of l.csv has no specimen in fits and is excluded (dora).",
         "1 of 3 specimens in fits has no row in l.csv (carl).",
     ]
     assert [(s.label, s.subject) for s in found] == [("smile", "Anna"), ("", "Ben"), ("", "")]

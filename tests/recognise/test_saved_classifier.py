@@ -205,25 +205,25 @@ def another_loader(members):
         (with_facts(format="other"), "is not a classifier of shapespace"),
         (with_facts(format_version=2), "format version 2"),
         (with_facts(classes=["anger", "anger", "smile"]), "is damaged"),
-        (with_facts(classes=["anger", "smile"]), "does not work|answers otherwise"),
-        (with_facts(classes=["smile", "fear", "anger"]), "answers otherwise"),
-        (with_facts(modes=4), "does not work|answers otherwise"),
+        (with_facts(classes=["anger", "smile"]), "does not work|gives other answers"),
+        (with_facts(classes=["smile", "fear", "anger"]), "gives other answers"),
+        (with_facts(modes=4), "does not work|gives other answers"),
         (with_facts(modes="many"), "is damaged"),
         (with_facts(modes=10**9), "is damaged"),
         (with_facts(temperature=0), "is damaged"),
         (with_facts(confidence=float("nan")), "is damaged"),
         (with_facts(training=3), "is damaged"),
         (with_facts(classifier="forest"), "is damaged"),
-        (with_facts(probe=[[0.3] * 3] * 4), "answers otherwise"),
+        (with_facts(probe=[[0.3] * 3] * 4), "gives other answers"),
         (with_facts(probe="x"), "does not work"),
         (cut_array, "cut short"),
         (huge_array, "cut short or holds objects"),
         (object_array, "cut short or holds objects"),
-        (other_numbers, "answers otherwise"),
+        (other_numbers, "gives other answers"),
         (scrambled_schema, "cannot be read"),
-        (other_type, "holds the type 'sklearn.preprocessing._data.MinMaxScaler'"),
-        (a_function, r"holds the type 'os\.system'.*do not trust"),
-        (another_loader, "holds a 'MethodNode'"),
+        (other_type, "contains the type 'sklearn.preprocessing._data.MinMaxScaler'"),
+        (a_function, r"contains the type 'os\.system'.*do not trust"),
+        (another_loader, "contains a 'MethodNode'"),
         (lambda m: m.update({"more.npy": b"nothing"}), "is not an array"),
     ],
 )  # fmt: skip
@@ -311,7 +311,7 @@ def test_other_estimators_are_refused_though_skops_trusts_them(tmp_path):
     bayes = make_pipeline(GaussianNB()).fit(z, labels)
     assert not skops.io.get_untrusted_types(data=skops.io.dumps(bayes))
     trained(pipeline=bayes).save(tmp_path / "f.skops")
-    with pytest.raises(FileFormatError, match=r"holds the type 'sklearn\.naive_bayes"):
+    with pytest.raises(FileFormatError, match=r"contains the type 'sklearn\.naive_bayes"):
         load_classifier(tmp_path / "f.skops")
 
 

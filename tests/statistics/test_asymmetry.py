@@ -303,7 +303,7 @@ def test_landmarks_alone_will_do(thing: Symmetric, tmp_path: Path) -> None:
     pairs = read_pairs(tmp_path / "pairs.csv", named)
     found = measure_asymmetry(named, pairs=pairs, permutations=9)
     assert len(found.sides) == 6 and found.normals is None
-    assert "are left out" in found.sides.notes[0]
+    assert "are excluded" in found.sides.notes[0]
     answer = analysis_report(found)
     points = next(p for p in answer.parts if p.title == "Vertices")
     assert {row[0] for row in points.rows} >= {"left", "right", "chin"}  # type: ignore[attr-defined]
@@ -364,7 +364,7 @@ def test_an_object_without_mirror_symmetry_is_refused() -> None:
     ("pairs", "said"),
     [
         ([(0, 10_000)], "there is no vertex 10000"),
-        ([(0, 1), (0, 2), (3, 4)], "stands in two pairs"),
+        ([(0, 1), (0, 2), (3, 4)], "is in two pairs"),
         ([(0, 1)], "name 2 vertices"),
         ([(k, (k * 7 + 3) % 5 + 60) for k in range(5)], "of its size from its mirror image by them"),
     ],

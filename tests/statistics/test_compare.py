@@ -490,7 +490,7 @@ def refused(table: dict[str, Any], formula: str, *words: str, options: CompareCo
         ("~ sex + both", ("follows from",)),
         ("~ sex * nested", ("follows from", "empty group")),
         ("~ each", ("columns for 37 shapes, so that no degrees of freedom are left",)),
-        ("~ mixed", ("'mixed' holds numbers but 'old'",)),
+        ("~ mixed", ("'mixed' contains numbers but 'old'",)),
         ("~ holes", ("holes of 2 of 37", "missing=drop")),
     ],
 )
@@ -544,7 +544,7 @@ def test_few_whole_numbers_that_are_used_as_a_number_are_named_first() -> None:
     told = result.cohort.cautions
     assert result.tests[0].df == 1 and len(told) == 2
     assert told[0] == (
-        "family has 4 different whole numbers (13, 14, 15, 16) and is used as a number, with 1 degree of freedom; if "
+        "family has 4 different integers (13, 14, 15, 16) and is used as a number, with 1 degree of freedom; if "
         "they are codes of classes, write C(family), with 3."
     )
     assert "write C(`Day #`), with 2." in told[1]

@@ -369,7 +369,7 @@ def test_groups_without_a_difference_are_classified_by_chance() -> None:
     ("test", "sizes", "options", "words"),
     [
         (compare_disparity, (1, 5), {}, "1 shape"),
-        (compare_disparity, (5, 5), {"partial": True, "formula": "~ group"}, "leave out --formula or --partial"),
+        (compare_disparity, (5, 5), {"partial": True, "formula": "~ group"}, "remove --formula or --partial"),
         (compare_means_and_covariances, (2, 8), {}, "3 or more"),
         (compare_means_and_covariances, (8, 8), {"components": 7}, "take 1 to 6"),
         (compare_means_and_covariances, (8, 8), {"components": 0}, "take 1 to 6"),

@@ -89,9 +89,9 @@ BAD = {
     "too many folds": (replace(FEW, folds=7), "cannot be split into 7 folds"),
     "one fold": (replace(FEW, folds=1), "cannot be split into 1 folds"),
     "a score that is none": (replace(FEW, scores=("cosine", "sine")), "not sine"),
-    "no score": (replace(FEW, scores=()), "none at all"),
-    "too many modes": (replace(FEW, modes=7), "7 cannot be had"),
-    "no mode": (replace(FEW, curve=(0,)), "0 cannot be had"),
+    "no score": (replace(FEW, scores=()), "an empty list"),
+    "too many modes": (replace(FEW, modes=7), "1 to 6, that of coefficients, not 7"),
+    "no mode": (replace(FEW, curve=(0,)), "1 to 6, that of coefficients, not 0"),
     "by what is not there": (replace(FEW, by="mood"), "has no column 'mood'"),
 }
 
@@ -139,7 +139,7 @@ def test_missing_cells_of_the_columns_of_expressions_are_counted(options):
         trial_of(shapes, replace(FEW, **options))
     if "train" not in options:  # which would be learned from people who are tested
         trial = trial_of(shapes, replace(FEW, drop_missing=True, **options))
-        assert len(trial.cohort) == 35 and any("1 of 36 shapes are left out" in note for note in trial.notes)
+        assert len(trial.cohort) == 35 and any("1 of 36 shapes are excluded" in note for note in trial.notes)
 
 
 def test_scans_of_nobody_are_refused_or_left_out():

@@ -162,7 +162,7 @@ def test_designs_without_an_ordination_are_refused() -> None:
         ({"method": "paca"}, "needs a phylogeny"),
         ({"group": ("none",)}, "no column 'none'"),
         ({"components": 3}, "cva alone"),
-        ({"method": "cva", "group": ("kind",), "tree": Path("tree.nwk")}, "leave out --tree"),
+        ({"method": "cva", "group": ("kind",), "tree": Path("tree.nwk")}, "remove --tree"),
     ):
         with pytest.raises(InputError, match=words):
             ordinate(cohort, **arguments)  # type: ignore[arg-type]

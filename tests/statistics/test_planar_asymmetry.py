@@ -189,7 +189,7 @@ def test_shapes_without_a_counterpart_are_left_out() -> None:
     cohort = wings(np.random.default_rng(2)).take(range(1, 4 * SUBJECTS))
     result = measure_asymmetry(cohort, side="side", permutations=0)
     assert result.counts.tolist() == [1, *[2] * (SUBJECTS - 1)]
-    assert result.sides.notes[0].startswith("1 shape without a counterpart on the other side is left out (s3)")
+    assert result.sides.notes[0].startswith("1 shape without a counterpart on the other side is excluded (s3)")
 
 
 def test_asymmetries_of_sides_that_do_not_differ_are_found_in_the_share_of_the_level() -> None:

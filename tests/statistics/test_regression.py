@@ -317,7 +317,7 @@ def test_what_lies_outside_is_said(learned: RegressionResult) -> None:
     steep = 20 * SLOPES / STDDEV / np.linalg.norm(SLOPES / STDDEV)
     new = replace(drawn(3, 0), coefficients=read_only(np.stack([far * 5, near, steep])))
     told = replace(learned.predictor, highest=60.0).predict(new)
-    assert "mm RMS from the mean, beyond all learned from" in told.outside[0]
+    assert "mm RMS from the mean, beyond all training shapes" in told.outside[0]
     assert told.outside[1] == "" and "was learned between" in told.outside[2]
 
 

@@ -221,7 +221,7 @@ def test_who_cannot_be_scored_is_refused_in_one_sentence() -> None:
         score(reference.take(range(4)), subjects)
     with pytest.raises(InputError, match="has 1 to 4 modes, not 9"):
         score(reference, subjects, ScoreConfig(modes=9))
-    with pytest.raises(InputError, match="r3 is in the reference too, as r3; leave it out"):
+    with pytest.raises(InputError, match="r3 is in the reference too, as r3; exclude one of the two scans"):
         score(reference, reference.take([3]))
     with pytest.raises(InputError, match="in the gauge shape, the subjects in form"):
         score(reference, replace(subjects, gauge="form"))
@@ -306,7 +306,7 @@ def test_one_subject_is_read_beside_a_reference_and_not_alone(fits: Path) -> Non
     fitted = read_cohort(fits, CohortConfig(surfaces="fitted"))
     one = read_cohort(fits.parent / "new", CohortConfig(surfaces="fitted"), onto=fitted)
     found, plain = score(fitted, one), score(reference, read_cohort(fits.parent / "new", onto=reference))
-    assert "uncertain each fit is was not taken into account" in " ".join(found.notes)
+    assert "The uncertainty of each fit was not taken into account" in " ".join(found.notes)
     assert found.distance[0] == pytest.approx(plain.distance[0], rel=0.1)
 
 

@@ -232,7 +232,7 @@ def test_the_slider_of_the_report_passes_through_the_mean_shapes() -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"along": "sex"}, "holds classes, and shapes are predicted along a number"),
+        ({"along": "sex"}, "contains classes, and shapes are predicted along a number"),
         ({"along": "same"}, "is 3 for all 30 shapes, so nothing changes along it"),
         ({"along": "weight"}, "no column"),
         ({"along": "gaps"}, "gaps of 1 of 30 shapes is missing"),
@@ -260,7 +260,7 @@ def test_missing_numbers_are_left_out_on_demand() -> None:
     made = study()
     ages = ("", *made.table.texts("age")[1:])
     found = predict_shapes(with_column(made, "age", ages), "age", permutations=0, drop_missing=True)
-    assert found.n_subjects == 29 and any("1 of 30 shapes are left out" in note for note in found.cohort.notes)
+    assert found.n_subjects == 29 and any("1 of 30 shapes are excluded" in note for note in found.cohort.notes)
 
 
 @pytest.mark.parametrize(("n", "curve", "least"), [(9, "linear", 10), (19, "spline", 20)])

@@ -123,7 +123,7 @@ def test_colours_of_surfaces_stay_with_theirs(singles: Path, tmp_path: Path) -> 
 def test_export_of_a_name_that_there_is_not_names_near_ones(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["export", str(store), "scan00", "-o", str(store.parent / "x")]) == 2
     told = capsys.readouterr().err
-    assert "holds no fit called scan00; there is scan0" in told
+    assert "contains no fit called scan00; there is scan0" in told
     assert not (store.parent / "x").exists()
 
 

@@ -146,7 +146,7 @@ def test_a_table_is_joined_by_id_or_file_name_and_may_be_pasted(project: Project
     assert [one.cells for one in project.state.specimens] == [{"sex": "f", "age": "12"}, {"sex": "m", "age": "14"}, {}]
     for content, error in (
         (b"x,y\n1,2\n", "needs rows, and a column file or scan"),
-        (b"id,y\nz,2\n", "the project holds no specimen of The table"),
+        (b"id,y\nz,2\n", "the project contains no specimen of The table"),
         (b"id,sex\nanna,f\nANNA.ply,m\n", r"rows 1 \('anna'\) and 2 \('ANNA.ply'\) are of one specimen;"),
         (b"", "table"),
     ):

@@ -1,7 +1,7 @@
 """A cohort: N shapes in correspondence, as coefficients in an orthonormal basis, with a table of covariates.
 
-Squared distances of coefficients are those of the shapes, so what sums over vertices (Procrustes distance, sums of
-squares) needs the coefficients alone, whatever the number of vertices.
+Squared distances of coefficients equal those of the shapes, so quantities that are sums over vertices (Procrustes
+distance, sums of squares) need only the coefficients, whatever the number of vertices.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from shapespace.schemas import Orientation, SurfaceReview
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, SurfaceLandmarks, common_faces, read_only
 
 SUBJECT = "subject"
-"""The column that says whose a shape is, unless another is named."""
+"""Column of the subjects, unless another is named."""
 
 LengthUnit: TypeAlias = Literal["mm", ""]
 """Unit of the lengths of a cohort; empty for coordinates without a unit."""
@@ -41,7 +41,7 @@ _TRUNCATED: tuple[ShapeKind, ...] = ("coefficients", "fitted")
 _UNIT_SIZE = 1e-2
 """Tolerance of unit centroid sizes, which identify aligned coordinates; tangent projection changes sizes by less."""
 _ORTHONORMAL = 1e-9  # largest deviation of U U^T from the identity (rounding)
-# Of the size; single precision keeps a copy nearer than this.
+# Share of the size; a copy in single precision differs by less than this.
 _SAME = 1e-6
 
 
@@ -70,13 +70,14 @@ class Fitted:
     """Fit diagnostics of a cohort, one row per shape.
 
     Args:
-        model: they are by.
+        model: model of the fits.
         b: (N, K) coefficients, mm.
-        b_stddev: (N, K) standard deviations of them, mm.
-        status: N of `converged`, `max_iterations` and, where they were asked for, `doubtful`.
-        folder: of the results, as it was given.
-        beyond_mm: (N,) RMS of what the model left of the residuals, mm, NaN where a fit does not say; None for none.
-        additive: the same model where its file parts identity and expression.
+        b_stddev: (N, K) standard deviations of the coefficients, mm.
+        status: status of each of the N fits: `converged`, `max_iterations` and, if they are included, `doubtful`.
+        folder: folder of the results, as it was passed.
+        beyond_mm: (N,) RMS of the residuals that the model does not explain, mm, NaN if a fit does not state it; None
+            if there is none.
+        additive: the same model, if its file separates identity and expression; None otherwise.
     """
 
     model: ShapeModel
@@ -95,10 +96,11 @@ class Fitted:
         return read_only(self.model.to_z(self.b))
 
     def source(self, kind: ShapeKind) -> ShapeSource:
-        """Return the source of shapes of one kind of these fits.
+        """Return the source of the shapes of these fits.
 
         Args:
-            kind: `coefficients` and `fitted` surfaces are limited to the modes of the fits; `dense` surfaces are not.
+            kind: kind of shapes: `coefficients` and `fitted` surfaces are limited to the modes of the fits; `dense`
+                surfaces are not.
         """
         if kind not in _TRUNCATED:
             return ShapeSource(kind)
@@ -108,7 +110,7 @@ class Fitted:
         return ShapeSource(kind, modes, ratio)
 
     def take(self, rows: Sequence[int]) -> Fitted:
-        """Return those of some rows."""
+        """Return the fits of some rows."""
         indices = np.asarray(rows, dtype=np.intp)
         return replace(
             self,
@@ -124,23 +126,23 @@ class Cohort:
     """N shapes in correspondence; shape i has the vertices reference + coefficients[i] basis, in one frame.
 
     Args:
-        names: of the shapes.
-        reference: (V, 3) mm, from which coefficients are counted; not the mean of these shapes.
+        names: names of the shapes.
+        reference: (V, 3) vertices from which coefficients are counted, mm; not the mean of these shapes.
         basis: (K, 3V) orthonormal rows.
-        coefficients: (N, K) mm, norms over all vertices.
-        sizes_mm: (N,) centroid sizes of the objects themselves; NaN where not known. In the `shape` gauge they are
-            divided out of the coefficients.
-        table: what is known of each, N rows in this order.
-        gauge: `shape` or `form`.
+        coefficients: (N, K) coefficients, mm, norms over all vertices.
+        sizes_mm: (N,) centroid sizes of the objects themselves; NaN if not known. In the `shape` gauge they are divided
+            out of the coefficients.
+        table: covariates, N rows in the order of the shapes.
+        gauge: size handling, `shape` or `form`.
         faces: (F, 3) triangles; None for points.
         landmarks: named points on the surfaces; a mapping of name to vertex may be given for those at vertices.
-        fitted: of fits; None for other surfaces.
-        notes: who was left out and why, a sentence each.
+        fitted: fit diagnostics; None for other surfaces.
+        notes: sentences on excluded shapes, with the reasons.
         cautions: sentences on the use of columns that answers begin with.
         drop_missing: whether all questions exclude shapes with missing values in the table.
         orientation: named views and links of the figures; None for views that are chosen by the form of the object.
         source: source of the shapes.
-        unit: of lengths: `mm`, or empty for coordinates without a unit, such as those of unit centroid size.
+        unit: unit of lengths: `mm`, or empty for coordinates without a unit, such as those of unit centroid size.
         observed: (N, V) bool, False for vertices that are estimates; None if all are observed.
         analysed: (V,) bool, False for vertices that too few shapes observe: there all shapes have one position, and
             nothing varies. None if all are analysed.
@@ -292,7 +294,7 @@ class Cohort:
         return self.reference + (coefficients @ self.basis).reshape(-1, 3)
 
     def mesh(self, shape: int | FloatArray, name: str = "") -> Mesh:
-        """Return the same as a mesh."""
+        """Return a shape as a mesh; arguments as for `vertices`."""
         mesh_name = name or (self.names[shape] if isinstance(shape, int) else "shape")
         return Mesh(self.vertices(shape), self.faces, name=mesh_name)
 
@@ -321,12 +323,13 @@ class Cohort:
         classes.
 
         Args:
-            columns: of the table, used as classes if not in `numbers`.
-            drop_missing: leave out the others, and say so in a note.
+            columns: columns of the table, used as classes if not in `numbers`.
+            drop_missing: whether to exclude shapes with missing values, with a note (default: an error).
             numbers: columns that are used as numbers; they must be among `columns`.
 
         Raises:
-            InputError: there is no such column, something is missing and `drop_missing` is not set, or nobody is left.
+            InputError: there is no such column, something is missing and `drop_missing` is not set, or no shape is
+                left.
         """
         missing = self.table.missing(columns)
         if not missing:
@@ -337,13 +340,13 @@ class Cohort:
         if not (drop_missing or self.drop_missing):
             raise InputError(
                 f"{self.table.where}: {' or '.join(columns)} of {len(missing)} of {len(self)} shapes is missing "
-                f"({excluded_names}); fill it in, or leave them out with --set missing=drop."
+                f"({excluded_names}); fill it in, or exclude them with --set missing=drop."
             )
         if len(missing) == len(self):
             raise InputError(f"{self.table.where}: no shape has all of {', '.join(columns)}; fill them in.")
         excluded = set(missing)
         note = (
-            f"{len(missing)} of {len(self)} shapes are left out, of which {' or '.join(columns)} is missing "
+            f"{len(missing)} of {len(self)} shapes are excluded because {' or '.join(columns)} is missing "
             f"({excluded_names})."
         )
         complete_shapes = self.take([row for row in range(len(self)) if row not in excluded], note)
@@ -371,23 +374,24 @@ class Cohort:
         half of the shapes observe are not analysed.
 
         Args:
-            shapes: (N, V, 3) mm; vertices that are not-a-number are missing.
-            columns: name -> N values, of the table; None and NaN are missing.
-            names: of the shapes; None numbers them.
+            shapes: (N, V, 3) vertices, mm; vertices that are not-a-number are missing.
+            columns: name -> N values, the columns of the table; None and NaN are missing.
+            names: names of the shapes; None numbers them.
             faces: (F, 3) triangles.
-            gauge: `shape` divides size out, and takes shapes in the tangent plane at their mean; `form` keeps it.
-            align: False takes them as they stand.
+            gauge: size handling: `shape` divides size out, and projects shapes to the tangent plane at their mean;
+                `form` keeps it.
+            align: whether to align the shapes; False uses them unchanged.
             landmarks: named points on the surfaces (`place_landmarks`), or name -> vertex.
-            onto: brings each shape, of which there may be one alone, to the mean of this cohort, in its gauge.
-            least: how many shapes there must be, where `onto` is None.
-            unit: of the coordinates: `mm`, or empty for none; None takes `mm`, unless all centroid sizes are 1, as
+            onto: cohort to whose mean each shape is aligned, in its gauge; there may then be a single shape.
+            least: smallest number of shapes, if `onto` is None.
+            unit: unit of the coordinates: `mm`, or empty for none; None for `mm`, unless all centroid sizes are 1, as
                 after a Procrustes superimposition, which divides the unit out.
             observed: (N, V) bool, False for vertices that are missing too; None if all others are observed.
-            samples: N, of shapes that are completed: their vertices that are not observed are used as they are. None
-                for a shape without.
+            samples: N samples of completed shapes, whose unobserved vertices are used as they are; None for each other
+                shape.
 
         Raises:
-            InputError: too few shapes, values that are infinite, hardly a vertex observed in a shape, columns of
+            InputError: too few shapes, infinite values, too few observed vertices in a shape, columns of
                 another length, two shapes that are the same, or other vertices than those of `onto`.
         """
         shapes = np.array(shapes, dtype=np.float64)
@@ -395,7 +399,7 @@ class Cohort:
         if shapes.ndim != 3 or shapes.shape[2] != 3 or len(shapes) < fewest or np.isinf(shapes).any():
             count_word = {1: "one", 2: "two"}.get(fewest, str(fewest))
             raise InputError(f"A cohort needs {count_word} or more finite shapes (N, V, 3), not {shapes.shape}.")
-        Mesh(shapes[0], faces, name="The cohort")  # refuses faces of other vertices
+        Mesh(shapes[0], faces, name="The cohort")  # rejects faces of other vertices
         if landmarks is not None:
             SurfaceLandmarks.of(landmarks).check(shapes.shape[1])
         if observed is not None and np.shape(observed) != shapes.shape[:2]:
@@ -446,12 +450,12 @@ class Cohort:
             gauge=gauge,
             faces=faces,
             landmarks=None if landmarks is None else SurfaceLandmarks.of(landmarks),
-            observed=_combined(mask, is_known if completed_rows else None, analysed),
+            observed=_combine_masks(mask, is_known if completed_rows else None, analysed),
             analysed=analysed,
             samples=tuple(samples) if completed_rows else (),
             unit=unit if unit is not None else "" if np.abs(sizes - 1.0).max() < _UNIT_SIZE else "mm",
         )
-        refuse_twice(cohort)
+        check_distinct(cohort)
         return cohort
 
     @staticmethod
@@ -459,10 +463,10 @@ class Cohort:
         """Return the cohort of aligned landmarks; planar ones have z = 0.
 
         Args:
-            aligned: as `align_landmarks` returns them.
-            table: N rows; None for the columns of the landmark file.
-            gauge: `form` multiplies shapes by their centroid sizes, `shape` divides forms by them; None for that of the
-                alignment.
+            aligned: result of `align_landmarks`.
+            table: covariates, N rows; None for the columns of the landmark file.
+            gauge: size handling: `form` multiplies shapes by their centroid sizes, `shape` divides forms by them; None
+                for that of the alignment.
 
         Raises:
             InputError: two specimens that are the same.
@@ -488,7 +492,7 @@ class Cohort:
             unit="mm" if gauge == "form" and aligned.unit == "mm" else "",
             observed=~aligned.estimated if aligned.estimated.any() else None,
         )
-        refuse_twice(cohort)
+        check_distinct(cohort)
         return cohort
 
     @staticmethod
@@ -500,12 +504,12 @@ class Cohort:
         least: int = 2,
         samples: Sequence[ShapeSamples | None] = (),
     ) -> Cohort:
-        """Return the cohort of meshes in correspondence, mm, after generalised Procrustes; `onto`, `least` and
-        `samples` as of `of_shapes`.
+        """Return the cohort of meshes in correspondence, mm, after generalised Procrustes; for `onto`, `least` and
+        `samples` see `of_shapes`.
 
         Raises:
             CorrespondenceError: meshes that differ in vertices or triangles.
-            InputError: as `of_shapes`.
+            InputError: shapes that `of_shapes` rejects.
         """
         has_triangles = onto is not None and onto.faces is not None and meshes[0].faces is not None
         known = [Mesh(onto.reference, onto.faces, name=onto.names[0])] if onto is not None and has_triangles else []
@@ -530,19 +534,19 @@ class Cohort:
     def of_fits(
         fitted: Fitted, names: Sequence[str], table: Table, sizes_mm: FloatArray, gauge: Gauge = "shape"
     ) -> Cohort:
-        """Return the cohort of fits: in the model's frame, where their poses are divided out already.
+        """Return the cohort of fits in the frame of the model, in which their poses are already divided out.
 
-        Sizes that a model of forms holds in its modes are divided out in the `shape` gauge.
+        In the `shape` gauge the sizes that a model of forms contains in its modes are divided out.
 
         Args:
-            fitted: the coefficients.
-            names: N.
-            table: N rows.
+            fitted: fits with their coefficients.
+            names: names of the N shapes.
+            table: covariates, N rows.
             sizes_mm: (N,) centroid sizes of the objects, mm.
-            gauge: `form` brings each to its own size.
+            gauge: size handling; `form` scales each shape to its own size.
 
         Raises:
-            InputError: the `form` gauge, and a size that is not known; two fits that are the same.
+            InputError: the `form` gauge with a size that is not known, or two fits that are the same.
         """
         model = fitted.model
         modes = fitted.b.shape[1]
@@ -561,7 +565,7 @@ class Cohort:
             if gauge == "form":
                 scales = sizes_mm / np.array([centroid_size(reference + (row @ rows).reshape(-1, 3)) for row in b])
             else:
-                # Of a model whose modes hold size, shapes are taken in the tangent plane at its mean.
+                # If the modes of a model contain size, shapes are projected to the tangent plane at its mean.
                 scales = 1 / (1 + b @ (rows @ middle) / (middle @ middle))
             mean = float(scales.mean())
             b = np.column_stack([b * scales[:, None], scales - mean])
@@ -581,11 +585,11 @@ class Cohort:
             fitted=fitted,
             source=fitted.source("coefficients"),
         )
-        refuse_twice(cohort)
+        check_distinct(cohort)
         return cohort
 
 
-def _combined(mask: BoolArray | None, known: BoolArray | None, analysed: BoolArray | None) -> BoolArray | None:
+def _combine_masks(mask: BoolArray | None, known: BoolArray | None, analysed: BoolArray | None) -> BoolArray | None:
     """Return the (N, V) observed vertices: those of `mask` that are also `known`, before shapes were completed."""
     if known is None:
         return mask
@@ -602,7 +606,7 @@ def _align_to(shapes: FloatArray, onto: Cohort) -> None:
     middle = mean - mean.mean(axis=0)
     for k, shape in enumerate(shapes[:, part]):
         if centroid_size(shape) <= 0:
-            raise InputError("All vertices of a shape coincide, so it cannot be aligned; leave it out.")
+            raise InputError("All vertices of a shape coincide, so it cannot be aligned; exclude it.")
         aligned = fit_similarity(shape, mean, with_scale=onto.gauge == "shape").apply(shape)
         if onto.gauge == "shape" and onto.source.kind == "landmarks":
             # Landmarks are projected orthogonally, as in their alignment.
@@ -631,7 +635,7 @@ def subjects_of(cohort: Cohort, column: str | None) -> tuple[str, ...]:
     shape.
 
     Raises:
-        InputError: there is no such column, or a cell of it says nothing.
+        InputError: there is no such column, or one of its cells is empty.
     """
     if column is None and SUBJECT not in cohort.table.columns:
         return cohort.names
@@ -639,16 +643,16 @@ def subjects_of(cohort: Cohort, column: str | None) -> tuple[str, ...]:
     if not all(cells):
         raise InputError(
             f"{cohort.table.where}: {column or SUBJECT!r} of {cohort.names[cells.index('')]} is missing; fill it in, "
-            "or leave such shapes out with --set missing=drop."
+            "or exclude such shapes with --set missing=drop."
         )
     return cells
 
 
-def refuse_twice(cohort: Cohort) -> None:
-    """Check that no two shapes are the same but for rounding, as of a scan that was copied, in another pose perhaps.
+def check_distinct(cohort: Cohort) -> None:
+    """Check that no two shapes are the same up to rounding, such as a scan that was copied, possibly in another pose.
 
     Raises:
-        InputError: two are; the sentence names them.
+        InputError: two shapes are the same; the message names them.
     """
     from scipy.spatial import cKDTree
 
@@ -657,7 +661,7 @@ def refuse_twice(cohort: Cohort) -> None:
     if len(pairs):
         least = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))[0]]
         first, second = cohort.names[int(least[0])], cohort.names[int(least[1])]
-        raise InputError(f"{first} and {second} are the same shape but for rounding; leave out one of them.")
+        raise InputError(f"{first} and {second} are the same shape up to rounding; exclude one.")
 
 
 def with_columns(cohort: Cohort, columns: Mapping[str, FloatArray]) -> Cohort:

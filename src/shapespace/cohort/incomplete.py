@@ -63,10 +63,10 @@ def completed_shapes(
     Vertices that fewer than `MIN_SEEN` of the shapes, or fewer than two, observe carry no variation.
 
     Args:
-        shapes: (N, V, 3) mm; where not observed any value, NaN included.
-        observed: (N, V).
-        names: N.
-        gauge: as of `align_in_place`.
+        shapes: (N, V, 3) vertices, mm; any value if not observed, NaN included.
+        observed: (N, V) whether each vertex is observed.
+        names: names of the N shapes.
+        gauge: size handling, see `align_in_place`.
         faces: (F, 3) triangles; None for points.
         align: whether to align the shapes; otherwise they are used unchanged.
 
@@ -75,7 +75,7 @@ def completed_shapes(
     """
     analysed = observed.sum(axis=0) >= max(MIN_SEEN * len(shapes) * (1 - 1e-12), _FEWEST_SHAPES)
     known = observed & analysed
-    _refuse_unobserved(known, names)
+    _check_observed(known, names)
     masked = np.where(known[:, :, None], shapes, np.nan)[:, analysed]
     completion = complete(masked, names, gauge, align=align)
     # Poses of the original shapes, which determine size and other vertices, do not depend on estimates.
@@ -97,25 +97,25 @@ def completed_shapes(
     return CompletedShapes(out, sizes, known, analysed)
 
 
-def _refuse_unobserved(known: BoolArray, names: Sequence[str]) -> None:
+def _check_observed(known: BoolArray, names: Sequence[str]) -> None:
     if not known.any():
         raise InputError(
-            f"No vertex is observed by {100 * MIN_SEEN:g} % of the shapes and two of them, so nothing can be compared; "
+            f"No vertex is observed by {100 * MIN_SEEN:g} % of the shapes and two shapes, so nothing can be compared; "
             "give shapes with fewer missing vertices."
         )
     too_sparse = [name for name, row in zip(names, known, strict=True) if row.sum() < _FEWEST_VERTICES]
     if too_sparse:
-        raise InputError(f"{list_names(too_sparse)}: too few vertices are observed; leave it out.")
+        raise InputError(f"{list_names(too_sparse)}: too few vertices are observed; exclude it.")
 
 
 def _one_position(shapes: FloatArray, mean: FloatArray, analysed: BoolArray, faces: IntArray | None) -> FloatArray:
     """Return one position (M, 3) per excluded vertex: the mean of the observed positions, or a harmonic interpolation.
 
     Args:
-        shapes: (N, V, 3) shapes as given, aligned; NaN where not observed.
-        mean: (A, 3) of the analysed vertices.
-        analysed: (V,).
-        faces: (F, 3).
+        shapes: (N, V, 3) shapes as given, aligned; NaN if not observed.
+        mean: (A, 3) mean of the analysed vertices.
+        analysed: (V,) whether each vertex is analysed.
+        faces: (F, 3) triangles; None for points.
     """
     is_complete: BoolArray = np.logical_and.reduce(np.isfinite(shapes), axis=2)
     count = is_complete.sum(axis=0)
@@ -153,16 +153,16 @@ def complete_by_population(
 
     Args:
         population: (N, V, 3) complete aligned shapes, mm.
-        mean: (V, 3) of them.
-        shapes: (M, V, 3) in any poses.
-        observed: (M, V).
-        names: M.
-        gauge: `shape` aligns with scale.
+        mean: (V, 3) mean of the population.
+        shapes: (M, V, 3) vertices of the shapes in any poses.
+        observed: (M, V) whether each vertex is observed.
+        names: names of the M shapes.
+        gauge: size handling; `shape` aligns with scale.
 
     Raises:
-        InputError: hardly a vertex of a shape is observed.
+        InputError: too few vertices of a shape are observed.
     """
-    _refuse_unobserved(observed, names)
+    _check_observed(observed, names)
     all_observed = np.ones(population.shape[:2], dtype=np.bool_)
     modes = max(1, min(round(_MODES_A_SHAPE * len(population)), _MOST_MODES, len(population) - 2))
     model = ppca(population.copy(), all_observed, modes)

@@ -114,16 +114,16 @@ def read_landmark_cohort(
     """Return the cohort of a landmark file, aligned by default options, or of a folder that `align` wrote.
 
     Args:
-        path: the file or folder.
-        table: of covariates, whose key column names the specimens; None for the columns of the file.
-        gauge: `shape` or `form`.
-        onto: brings the specimens, of which there may be one alone, to the mean of this cohort.
-        least: how many specimens there must be, where `onto` is None.
+        path: file or folder.
+        table: table of covariates, whose key column names the specimens; None for the columns of the file.
+        gauge: size handling, `shape` or `form`.
+        onto: cohort to whose mean the specimens are aligned; there may then be a single specimen.
+        least: smallest number of specimens, if `onto` is None.
 
     Raises:
-        FileError: something cannot be read.
-        FileFormatError: something is damaged.
-        InputError: specimens that cannot be aligned, or too few of them in the table.
+        FileError: a file cannot be read.
+        FileFormatError: a file is damaged.
+        InputError: specimens that cannot be aligned, or too few specimens in the table.
     """
     source = read_aligned(path) if (path / RECORD).is_file() else read_configurations(path)
     rows, covariates, notes = join_table(source.names, source.columns, table, str(path))
@@ -133,20 +133,20 @@ def read_landmark_cohort(
     if isinstance(source, AlignedLandmarks):
         if onto is not None:
             coords = np.where(source.estimated[..., None], np.nan, source.forms)[rows]
-            return _onto(coords, source.landmarks, covariates, onto, notes, source.sizes[rows])
+            return _align_onto(coords, source.landmarks, covariates, onto, notes, source.sizes[rows])
         cohort = Cohort.of_landmarks(source, gauge=gauge).take(rows)
         return replace(cohort, table=covariates, notes=(*notes, *cohort.notes))
     raw = replace(source, names=covariates.rows, points=source.points[rows], columns={})
     if onto is not None:
         mean = onto.vertices(onto.coefficients.mean(axis=0))[:, : onto.dimensions]
         raw = match_curves(raw, mean) if raw.points.shape[1:] == mean.shape else raw
-        return _onto(raw.points, raw.landmarks, covariates, onto, [*raw.notes, *notes])
+        return _align_onto(raw.points, raw.landmarks, covariates, onto, [*raw.notes, *notes])
     cohort = Cohort.of_landmarks(align_landmarks(raw, AlignConfig(gauge=gauge)), covariates)
     note = "The landmarks are aligned by generalised Procrustes analysis with default options."
     return replace(cohort, notes=(*notes, note, *cohort.notes))
 
 
-def _onto(
+def _align_onto(
     coords: FloatArray, landmarks: Sequence[str], table: Table, onto: Cohort, notes: Sequence[str],
     sizes: FloatArray | None = None,
 ) -> Cohort:  # fmt: skip
@@ -176,11 +176,11 @@ def _onto(
 
 
 def landmark_cohort(cohort: Cohort, onto: Cohort | None = None) -> Cohort:
-    """Return the cohort of the landmarks that the surfaces of a cohort carry, aligned by themselves.
+    """Return the cohort of the landmarks on the surfaces of a cohort, aligned without the surfaces.
 
     Args:
-        cohort: of surfaces with `landmarks`; landmarks between unobserved vertices are marked as estimated.
-        onto: a cohort of landmarks, to whose mean they are brought; None aligns them.
+        cohort: cohort of surfaces with `landmarks`; landmarks between unobserved vertices are marked as estimated.
+        onto: cohort of landmarks, to whose mean they are aligned; None aligns them to each other.
 
     Raises:
         InputError: surfaces without landmarks, or with fewer than three.
@@ -198,7 +198,7 @@ def landmark_cohort(cohort: Cohort, onto: Cohort | None = None) -> Cohort:
     scale = np.where(np.isfinite(cohort.sizes_mm), cohort.sizes_mm / surface, 1.0)
     coords = coords * scale[:, None, None]
     if onto is not None:
-        return _onto(coords, marks.names, cohort.table, onto, cohort.notes)
+        return _align_onto(coords, marks.names, cohort.table, onto, cohort.notes)
     names = tuple(marks.names)
     configurations = LandmarkConfigurations(
         names=cohort.names, points=coords, landmarks=names, unit=cohort.unit, where=cohort.table.where
@@ -207,7 +207,7 @@ def landmark_cohort(cohort: Cohort, onto: Cohort | None = None) -> Cohort:
     if cohort.observed is not None:
         unseen = np.logical_and(~cohort.observed[:, marks.corners], marks.barycentric > 0).any(axis=2)
         aligned = replace(aligned, estimated=unseen)
-    note = f"The analysis is of {len(names)} landmarks that the surfaces carry, aligned by themselves."
+    note = f"The analysis is of {len(names)} landmarks on the surfaces, aligned without the surfaces."
     return replace(Cohort.of_landmarks(aligned, cohort.table), notes=(*cohort.notes, note))
 
 
@@ -222,12 +222,12 @@ def join_table(
     """Return specimens, their covariates from the landmark file and a table, and notes on those without a row.
 
     Args:
-        names: of the specimens.
+        names: names of the specimens.
         columns: covariates in the landmark file.
-        table: of further covariates, whose key column names the specimens; None for none.
-        where: what the specimens are called in messages.
-        keep_unmatched: keep specimens without a row, with empty cells, in the order of `names`; otherwise specimens
-            are sorted by name.
+        table: table of further covariates, whose key column names the specimens; None for none.
+        where: name of the specimens in messages.
+        keep_unmatched: whether to keep specimens without a row, with empty cells, in the order of `names`; otherwise
+            specimens are sorted by name.
 
     Raises:
         InputError: no row is of a specimen.

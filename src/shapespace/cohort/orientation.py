@@ -1,4 +1,4 @@
-"""Named views of an object, such as dorsal and lateral, in which all figures draw it."""
+"""Named views of an object, such as dorsal and lateral, for all figures."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _ORIENTATION: ContextVar[Orientation] = ContextVar("orientation", default=_NO_VI
 
 @contextmanager
 def oriented(orientation: Orientation | None) -> Generator[None]:
-    """Return a context in which figures have the named views and links of an orientation; None for none."""
+    """Return a context that sets the named views and links of figures to an orientation; None for the defaults."""
     token = _ORIENTATION.set(orientation or _NO_VIEWS)
     try:
         yield
@@ -49,10 +49,10 @@ def find_orientation(
     """Return the orientation of a file, or of orientation.json and links.csv in the first folders that have them.
 
     Args:
-        path: the file; None searches the folders.
-        folders: of the shapes.
+        path: file of the orientation; None searches the folders.
+        folders: folders of the shapes.
         landmarks: names of the landmarks, which links.csv may have; None for numbers alone.
-        curve_links: links where the files have none.
+        curve_links: links that are used if the files have none.
 
     Raises:
         FileError: a file cannot be read.

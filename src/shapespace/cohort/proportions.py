@@ -19,7 +19,7 @@ def zero_bound(subjects: int, level: float = 0.95) -> float:
 
     Args:
         subjects: number of independent units; if it is 0, the bound is 1.
-        level: of the two-sided interval.
+        level: level of the two-sided interval.
     """
     return 1.0 - float((0.5 * (1.0 - level)) ** (1.0 / subjects)) if subjects > 0 else 1.0
 
@@ -34,7 +34,7 @@ def widen_share(
     Args:
         low, high: ends of bootstrap intervals, of any shape; NaN stays NaN.
         subjects: number of independent units.
-        level: of the intervals.
+        level: level of the intervals.
     """
     bound = zero_bound(subjects, level)
     return np.asarray(np.minimum(low, 1.0 - bound)), np.asarray(np.maximum(high, bound))

@@ -34,7 +34,7 @@ from shapespace.types import FloatArray, Mesh, SurfaceLandmarks, read_only
 Geometry: TypeAlias = Literal["surface", "landmarks"]
 Surfaces: TypeAlias = Literal["auto", "coefficients", "fitted", "dense"]
 SURFACES: tuple[Surfaces, ...] = ("auto", "coefficients", "fitted", "dense")
-"""Shapes of fits: the model's coefficients, or a surface stored with the record. `auto` is dense where all have one."""
+"""Shapes of fits: the model's coefficients, or a surface stored with the record. `auto` is dense if all have one."""
 
 PATHS = ("shapes", "model", "landmarks", "orientation")
 """Fields of `CohortConfig` that are paths."""
@@ -43,10 +43,10 @@ COHORT_ENDING = ".toml"
 _LONGEST_FILE = 1_000_000  # bytes of a cohort file
 _KINDS = {"a text": str, "a whole number": int, "true or false": bool}  # of values in a cohort file
 _OF_QUESTIONS = ("least", "accept_review")
-"""Fields of `CohortConfig` that a question sets."""
+"""Fields of `CohortConfig` that an analysis sets."""
 _USED = ("converged", "max_iterations")
 _LANDMARKS = "landmarks.csv"
-"""Landmarks that all meshes of a folder carry, as `correspond` writes them."""
+"""Landmarks of all meshes of a folder, as `correspond` writes them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,22 +54,23 @@ class CohortConfig:
     """Options for the selection and comparison of shapes.
 
     Args:
-        shapes: folder of results of fits, or of meshes in correspondence, that align wrote, or a landmark file
+        shapes: folder of results of fits, of meshes in correspondence, or of the output of align; or a landmark file
             (default: the folder of the table).
         model: model file of the fits, if it was moved.
         surfaces: shapes of fits: `coefficients` of the model, its `fitted` surface, or the `dense` surface on the scan;
             `auto` uses dense surfaces if all fits have one, otherwise coefficients.
-        gauge: `form` keeps size, `shape` divides size out.
-        doubtful: include doubtful fits and corresponding surfaces (default: excluded, and counted), and use a
-            correspondence in which more than half of the surfaces need review.
-        accept_review: use such a correspondence, without its doubtful surfaces (default: the value of `doubtful`).
+        gauge: size handling: `form` keeps size, `shape` divides size out.
+        doubtful: whether to include doubtful fits and corresponding surfaces (default: excluded, and counted), and to
+            use a correspondence in which more than half of the surfaces need review.
+        accept_review: whether to use such a correspondence, without its doubtful surfaces (default: the value of
+            `doubtful`).
         geometry: analysed part of surfaces with landmarks: the `surface`, or the `landmarks` alone.
-        least: shapes that there must be; one will do where it is compared with what is known already.
+        least: smallest number of shapes; a single shape suffices if it is compared with an existing cohort.
         imputations: number of samples of each completed shape (NAME.samples.npz next to NAME.ply) that compare,
             regress, asymmetry and score combine by Rubin's rules; 0 or 1 ignores samples.
         unit: unit of the lengths; `none` for coordinates without a unit, as those of digitised landmarks.
-        missing: `refuse` shapes with missing values in the table, or `drop` them.
-        subject: column that names whose a shape is (default: subject).
+        missing: treatment of shapes with missing values in the table: `drop` excludes them (default: an error).
+        subject: column of the subjects (default: subject).
         landmarks: CSV of name,vertex, or landmarks.csv of correspond (default: those of the model or the folder).
         orientation: JSON file with named views of the object, such as dorsal, and links between landmarks (default:
             orientation.json and links.csv next to the shapes).
@@ -118,8 +119,8 @@ def read_cohort_file(path: Path) -> tuple[Path, dict[str, Any]]:
 
     Raises:
         FileError: the file cannot be read.
-        FileFormatError: it is not TOML, has no data, or has a setting that there is not.
-        InputError: a value that a setting does not have.
+        FileFormatError: the file is not TOML, has no data, or has an unknown setting.
+        InputError: a setting has a value that is not allowed.
     """
     again = "write it again with shapespace cohort"
     try:
@@ -141,15 +142,15 @@ def read_cohort_file(path: Path) -> tuple[Path, dict[str, Any]]:
 
 
 def write_cohort_file(path: Path | str, data: Path | str, **settings: Any) -> None:
-    """Write a cohort file: the data and the settings of a cohort, which all questions about its shapes read.
+    """Write a cohort file: the data and the settings of a cohort, which all analyses of its shapes read.
 
     Args:
-        path: NAME.toml.
+        path: path of the file, NAME.toml.
         data: table, folder or landmark file.
-        settings: fields of `CohortConfig`; those that are not given keep their default.
+        settings: fields of `CohortConfig`; fields that are not given keep their default.
 
     Raises:
-        InputError: another ending, or a setting that there is not.
+        InputError: another ending, or an unknown setting.
         FileError: the file cannot be written.
 
     Example:
@@ -184,31 +185,31 @@ def read_cohort(
 
     Landmarks are read from a folder that `align` wrote, or from a landmark file, and are then aligned by its defaults.
 
-    Doubtful and failed fits are left out, counted and said in the notes, as are rows without a shape and shapes
+    Doubtful and failed fits are excluded, counted and reported in the notes, as are rows without a shape and shapes
     without a row.
 
     Args:
         data: a table whose column `file`, `scan`, `specimen`, `name` or `id` names a shape in each row
             (coefficients.csv is one), as a file or a DataFrame; a folder of results of fits, whose metadata are the
             table; landmarks; or a cohort file (`write_cohort_file`).
-        config: which shapes; None for the defaults, or those of the cohort file.
-        onto: a cohort that these shapes, of which there may be one alone, are to be compared with.
-        on_shape: called with (done, total) as surfaces are read.
+        config: selection of the shapes; None for the defaults, or those of the cohort file.
+        onto: cohort with which these shapes are to be compared; there may then be a single shape.
+        on_shape: function called with (done, total) as surfaces are read.
 
     Raises:
-        FileError: something cannot be read.
-        FileFormatError: something is damaged, or the table is none.
+        FileError: a file cannot be read.
+        FileFormatError: a file is damaged, or the table is none.
         InputError: no row has a shape, fits of different models, the same scan twice, fewer than two shapes, or
             settings in addition to those of a cohort file.
         CorrespondenceError: meshes that are not in correspondence.
     """
     if is_cohort_file(data):
         if config is not None:
-            raise InputError(f"{data} contains the settings of the cohort; leave the others out, or give its table.")
+            raise InputError(f"{data} contains the settings of the cohort; remove the others, or give its table.")
         data, stated = read_cohort_file(Path(data))
         config = CohortConfig(**stated)
     config = config or CohortConfig()
-    cohort = _read(data, config, onto, on_shape)
+    cohort = _read_shapes(data, config, onto, on_shape)
     if config.landmarks is not None:
         cohort = replace(cohort, landmarks=_landmarks_of(Path(config.landmarks), cohort.n_vertices))
     if config.subject is not None:
@@ -235,7 +236,7 @@ def _landmarks_of(path: Path, n_vertices: int) -> SurfaceLandmarks:
     return found
 
 
-def _read(
+def _read_shapes(
     data: Path | str | Any, config: CohortConfig, onto: Cohort | None, on_shape: Callable[[int, int], None] | None
 ) -> Cohort:
     given: Table | None = None
@@ -252,7 +253,7 @@ def _read(
         return read_landmark_cohort(source, table, config.gauge, onto, config.least)
     if config.geometry == "landmarks":
         least = 1 if onto is not None else config.least
-        surfaces = _read(given or data, replace(config, geometry="surface", least=least), None, on_shape)
+        surfaces = _read_shapes(given or data, replace(config, geometry="surface", least=least), None, on_shape)
         if surfaces.samples:
             note = (
                 "The samples of completed shapes are not used for landmarks, so p does not contain their uncertainty."
@@ -271,13 +272,13 @@ def _read(
         )
     results = Results(folder) if folder != source or results is None else results
     if len(results):
-        return _of_results(results, table, config, onto, on_shape)
+        return _cohort_of_results(results, table, config, onto, on_shape)
     if table is None:
         raise InputError(
-            f"{folder} holds neither results of fits nor landmark files; give a CSV table of its meshes, and the "
+            f"{folder} contains neither results of fits nor landmark files; give a CSV table of its meshes, and the "
             "folder as --shapes."
         )
-    return _of_surfaces(folder, table, config, onto, on_shape)
+    return _cohort_of_surfaces(folder, table, config, onto, on_shape)
 
 
 @dataclass(frozen=True, eq=False)
@@ -324,7 +325,7 @@ def _rows(results: Results) -> list[_Row]:
     return sorted(rows, key=lambda row: name_key(row.name))
 
 
-def _of_results(
+def _cohort_of_results(
     results: Results,
     table: Table | None,
     config: CohortConfig,
@@ -348,7 +349,7 @@ def _of_results(
     accepted = [(row, index) for row, index in pairs if row.status in used]
     for status, count in Counter(row.status for row, _ in pairs if row.status not in used).items():
         excluded_names = list_names([row.name for row, _ in pairs if row.status == status])
-        notes.append(f"{count} of {len(pairs)} fits are left out, which are {status} ({excluded_names}).")
+        notes.append(f"{count} of {len(pairs)} fits are excluded, which are {status} ({excluded_names}).")
     least = config.least if onto is None else 1
     if len(accepted) < least:
         raise InputError(
@@ -356,7 +357,7 @@ def _of_results(
             + (notes[-1] if notes else "fit more scans.")
         )
     fits = [row for row, _ in accepted]
-    _refuse_mixed(fits, results.folder)
+    _check_same_model(fits, results.folder)
     model, additive = _model_of(results, fits[0], None if config.model is None else Path(config.model))
     names = tuple(row.name for row in fits)
     stated = replace(table.take([index for _, index in accepted]), rows=names)
@@ -371,7 +372,7 @@ def _of_results(
         beyond_mm=read_only([row.beyond_mm for row in fits]),
         additive=additive,
     )
-    kind = _kind(config.surfaces, results, names, config.gauge, fits, onto)
+    kind = _choose_kind(config.surfaces, results, names, config.gauge, fits, onto)
     if kind == "coefficients":
         cohort = Cohort.of_fits(fitted, names, stated, sizes, config.gauge)
     else:
@@ -379,7 +380,7 @@ def _of_results(
         if without_surface:
             dense = " with --dense" if kind == "dense" else ""
             raise InputError(
-                f"{results.folder} holds no {kind} surface of {list_names(without_surface)}; fit them again{dense}."
+                f"{results.folder} contains no {kind} surface of {list_names(without_surface)}; fit them again{dense}."
             )
         unknown = [row.name for row in fits if not np.isfinite(row.mm_per_unit)]
         if unknown and config.gauge == "form":
@@ -404,7 +405,7 @@ def _of_results(
     return replace(cohort, notes=(*notes, *cohort.notes))
 
 
-def _kind(
+def _choose_kind(
     surfaces: Surfaces, results: Results, names: Sequence[str], gauge: Gauge, fits: Sequence[_Row], onto: Cohort | None
 ) -> Literal["coefficients", "fitted", "dense"]:
     """Return the kind of shapes of fits to read: the requested one, or for `auto` the most complete one."""
@@ -416,7 +417,7 @@ def _kind(
     return "dense" if sized and all(results.has(name, "dense") for name in names) else "coefficients"
 
 
-def _of_surfaces(
+def _cohort_of_surfaces(
     folder: Path,
     table: Table,
     config: CohortConfig,
@@ -462,7 +463,7 @@ def _of_surfaces(
 
 
 def _match_files(table: Table, listing: SurfaceFiles, folder: Path) -> tuple[list[tuple[Path, int]], list[str]]:
-    """Return the surface and the number of each row that has one, and notes as of `match_rows`."""
+    """Return the surface and the number of each row that has a surface, and the notes of `match_rows`."""
     # A completion may be written in several formats; its samples are of the vertices of the PLY file.
     files = {
         surface_stem(file): file
@@ -473,20 +474,18 @@ def _match_files(table: Table, listing: SurfaceFiles, folder: Path) -> tuple[lis
     return [(list(files.values())[k], row) for row, k in rows.items()], notes
 
 
-def _refuse_mixed(fits: Sequence[_Row], folder: Path) -> None:
+def _check_same_model(fits: Sequence[_Row], folder: Path) -> None:
     hashes = sorted({row.model_hash for row in fits})
     if len(hashes) > 1:
         raise InputError(
-            f"{folder} holds fits of {len(hashes)} different models ({', '.join(h[:12] for h in hashes[:3])}), whose "
-            "coefficients cannot be compared; fit all scans with one model."
+            f"{folder} contains fits of {len(hashes)} different models ({', '.join(h[:12] for h in hashes[:3])}), "
+            "whose coefficients cannot be compared; fit all scans with one model."
         )
     first_names: dict[str, str] = {}
     for row in fits:
         first_name = first_names.setdefault(row.scan_hash or row.name, row.name)
         if first_name != row.name:
-            raise InputError(
-                f"{first_name} and {row.name} are fits of the same scan; leave one of them out of the table."
-            )
+            raise InputError(f"{first_name} and {row.name} are fits of the same scan; remove one from the table.")
 
 
 def _model_of(results: Results, fit: _Row, given: Path | None) -> tuple[ShapeModel, AdditiveModel | None]:

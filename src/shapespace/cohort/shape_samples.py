@@ -14,7 +14,7 @@ from shapespace.io.containers.archives import read_row
 from shapespace.types import FloatArray, Mesh
 
 ENDING = ".samples.npz"
-"""Of the samples of NAME.ply: an array `vertices` (S, V, 3) in the frame and unit of the surface."""
+"""Ending of the samples of NAME.ply: an array `vertices` (S, V, 3) in the frame and unit of the surface."""
 _AGAIN = "write it again with shapespace complete, or remove it"
 _FARTHEST = 0.5
 """RMS distance of a sample from its surface, as a share of the size; between shapes of one kind it is below 0.2."""
@@ -33,9 +33,9 @@ class SampleFile:
     """The first samples in a file.
 
     Args:
-        path: of the file.
+        path: path of the file.
         count: number of samples that are used.
-        n_vertices: of each.
+        n_vertices: number of vertices of each sample.
     """
 
     path: Path

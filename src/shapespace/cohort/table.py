@@ -1,4 +1,4 @@
-"""Covariates of shapes, such as subject, sex and age: a table with one row for each, read from CSV or Excel files.
+"""Covariates of shapes, such as subject, sex and age: a table with one row for each shape, from CSV or Excel files.
 
 Likely misspellings of its classes are named: classes with one shape, and classes with similar names.
 """
@@ -35,9 +35,9 @@ class Table:
     """Covariates of N shapes, as text without white space at its ends.
 
     Args:
-        columns: name -> N cells; a missing one is empty.
-        rows: what each row is called in messages, N of them.
-        where: what the table is called in messages.
+        columns: name -> N cells; a missing cell is empty.
+        rows: names of the N rows in messages.
+        where: name of the table in messages.
 
     Raises:
         InputError: columns of another length.
@@ -58,9 +58,7 @@ class Table:
                 )
         plain = {name.strip(): tuple(map(str.strip, cells)) for name, cells in self.columns.items()}
         if len(plain) < len(self.columns):
-            raise InputError(
-                f"{self.where} has two columns whose names differ only in white space; rename one of them."
-            )
+            raise InputError(f"{self.where} has two columns whose names differ only in white space; rename one.")
         object.__setattr__(self, "columns", plain)
 
     @staticmethod
@@ -68,14 +66,14 @@ class Table:
         """Return the table in a DataFrame of pandas or polars, or in a mapping of name to cells.
 
         The first of the columns `file`, `scan`, `specimen`, `name` and `id` names the specimens, as in files; without
-        one, the index of a pandas DataFrame does, where it holds names.
+        such a column, the index of a pandas DataFrame does, if it contains names.
 
         Args:
             data: the table.
-            where: what the table is called in messages.
+            where: name of the table in messages.
 
         Raises:
-            InputError: it is no table, has no rows or two columns of one name, or names no specimens.
+            InputError: the data are no table, have no rows or two columns of one name, or name no specimens.
         """
         own: list[Any] = list(
             data.columns if hasattr(data, "columns") else data.keys() if hasattr(data, "keys") else ()
@@ -84,7 +82,7 @@ class Table:
         if not heads:
             raise InputError(f"{where} is no DataFrame or mapping with columns, but {type(data).__name__}; give one.")
         if len(set(heads)) < len(heads):
-            raise InputError(f"{where} has two columns of one name; rename one of them.")
+            raise InputError(f"{where} has two columns of one name; rename one.")
         columns = {head: tuple(cell_text(value) for value in data[name]) for head, name in zip(heads, own, strict=True)}
         key = key_column(heads)
         index: Any = getattr(data, "index", None)
@@ -124,7 +122,7 @@ class Table:
             return "text"
         if not_numeric:
             raise InputError(
-                f"{self.where}: {column!r} holds numbers but {cells[not_numeric[0]][:40]!r} at {not_numeric[0]}"
+                f"{self.where}: {column!r} contains numbers but {cells[not_numeric[0]][:40]!r} at {not_numeric[0]}"
                 f"{_others_note(len(not_numeric) - 1)}; write a number there, or leave it empty."
             )
         return "number"
@@ -157,19 +155,19 @@ class Table:
 
 
 def read_table(path: Path, content: bytes | None = None) -> Table:
-    """Return a table whose rows are called as its key column names them; `match_rows` finds their specimens.
+    """Return a table whose rows are named by its key column; `match_rows` finds their specimens.
 
-    The table is what `io.tables.table_rows` reads. The first of the columns `file`, `scan`, `specimen`, `name` and `id`
+    The file is read by `io.tables.table_rows`. The first of the columns `file`, `scan`, `specimen`, `name` and `id`
     that it has, in any case, names the specimens. Columns of a coefficients.csv that came with the list of its scans
-    lose their `meta_`.
+    lose their prefix `meta_`.
 
     Args:
         path: the file.
-        content: its bytes; None to read them.
+        content: content of the file; None to read it.
 
     Raises:
-        FileError: it cannot be read.
-        FileFormatError: it is no such table.
+        FileError: the file cannot be read.
+        FileFormatError: the file is no such table.
     """
     if content is None:
         check_file(path, _LARGEST_BYTES, "give a smaller table")
@@ -186,7 +184,7 @@ def read_table(path: Path, content: bytes | None = None) -> Table:
     names = tuple(row[key] for row in rows)
     if "" in names:
         raise FileFormatError(
-            f"{path} has no {heads[key]} in row {names.index('') + 1}; name the specimen, or leave the row out."
+            f"{path} has no {heads[key]} in row {names.index('') + 1}; name the specimen, or remove the row."
         )
     columns: dict[str, tuple[str, ...]] = {}
     for index, head in enumerate(heads):
@@ -209,23 +207,23 @@ def match_rows(
 ) -> tuple[dict[int, int], list[str]]:
     """Return the number of the specimen of each row that has one, by name, and sentences on rows and specimens without.
 
-    A row names its specimen, or the file of it with or without ending and folders, which may be joined by `_` as in the
-    names of fits. Case, white space at the ends and the Unicode form of letters count only where specimens differ in
+    A row names its specimen, or its file with or without ending and folders, which may be joined by `_` as in the names
+    of fits. Case, white space at the ends and the Unicode form of letters are significant only if specimens differ in
     nothing else.
 
     Args:
-        table: as `read_table` reads it.
-        specimens: names of each specimen; the first one is that of messages.
+        table: result of `read_table`.
+        specimens: names of each specimen; the first name is used in messages.
         where: place of the specimens, in messages.
         remedy: advice if no row has a specimen.
 
     Raises:
         FileFormatError: two rows are of one specimen.
-        InputError: no row is of a specimen.
+        InputError: no row names a specimen.
     """
     indices = [(form, _specimen_index(specimens, form)) for form in (str, fold_name)]
     places = [PurePath(name.replace("\\", "/")) for name in table.rows]
-    # A file name that rows have in different folders names none of them.
+    # A file name that rows have in different folders names no specimen.
     folders: dict[str, set[str]] = {}
     for place in places:
         folders.setdefault(fold_name(stem_of(place)), set()).update({fold_name(str(place.parent))} - {"."})
@@ -235,7 +233,7 @@ def match_rows(
         parts, stem = [part for part in place.parent.parts if part not in (".", "/")], stem_of(place)
         named = [name, *("_".join((*parts[k:], stem)) for k in range(max(len(parts), 1)))]
         named += [place.name, stem] if len(folders[fold_name(stem)]) < 2 else []
-        found = (index.get(form(one)) for one in named for form, index in indices)
+        found = (index.get(form(text)) for text in named for form, index in indices)
         number = next((k for k in found if k is not None), None)
         if number is not None:
             matched[row] = number
@@ -245,7 +243,7 @@ def match_rows(
     unknown = [name for row, name in enumerate(table.rows) if row not in matched]
     if not matched:
         raise InputError(
-            f"{where} holds no specimen of {table.where} (rows such as {list_names(unknown)}; specimens "
+            f"{where} contains no specimen of {table.where} (rows such as {list_names(unknown)}; specimens "
             f"{list_names(names) or 'none'}); {remedy}."
         )
     used = set(matched.values())
@@ -254,7 +252,7 @@ def match_rows(
     if unknown:
         verb = "has no specimen in {0} and is" if len(unknown) == 1 else "have no specimen in {0} and are"
         notes.append(
-            f"{len(unknown)} of {len(table)} rows of {table.where} {verb.format(where)} left out "
+            f"{len(unknown)} of {len(table)} rows of {table.where} {verb.format(where)} excluded "
             f"({list_names(unknown)})."
         )
     if unmatched:
@@ -266,10 +264,10 @@ def match_rows(
 
 
 def refuse_repeated(where: Path | str, rows: Sequence[str], owners: Sequence[Hashable], noun: str = "specimen") -> None:
-    """Check that no two rows of a table, called `rows`, have the same owner.
+    """Check that no two rows of a table, named `rows`, have the same owner.
 
     Raises:
-        FileFormatError: two have; the sentence names them.
+        FileFormatError: two rows have the same owner; the message names them.
     """
     rows_by_owner: dict[Hashable, list[str]] = {}
     for number, (name, owner) in enumerate(zip(rows, owners, strict=True), 1):
@@ -289,7 +287,7 @@ def fold_name(name: str) -> str:
 
 
 def names_of_file(path: PurePath | str) -> tuple[str, ...]:
-    """Return the names by which a row can mean the specimen in a file, for `match_rows`: the usual one first."""
+    """Return the names by which a row can refer to the specimen in a file, for `match_rows`: the usual name first."""
     folders = PurePath(path).parent.parts[1:]
     stem = stem_of(path)
     joined = ("_".join((*folders[-depth:], stem)) for depth in range(1, len(folders) + 1))
@@ -297,7 +295,7 @@ def names_of_file(path: PurePath | str) -> tuple[str, ...]:
 
 
 def _specimen_index(specimens: Sequence[Sequence[str]], form: Callable[[str], str]) -> dict[str, int]:
-    """Return name -> specimen for names of one specimen alone; a first name goes before the further ones of others."""
+    """Return name -> specimen for unambiguous names; first names have priority over further names of others."""
     index: dict[str, int] = {}
     for depth in range(max(map(len, specimens), default=0)):
         owners: dict[str, set[int]] = {}
@@ -309,9 +307,9 @@ def _specimen_index(specimens: Sequence[Sequence[str]], form: Callable[[str], st
 
 
 def cell_text(value: object) -> str:
-    """Return the text of a value of a column in memory; empty for a missing one."""
+    """Return the text of a value of a column in memory; empty for a missing value."""
     if isinstance(value, float) and value.is_integer():  # also NumPy's float64
-        return str(int(value))  # as of whole numbers in a column with missing values
+        return str(int(value))  # integers in a column with missing values are floats
     text = "" if value is None else str(value)
     return "" if text in ("<NA>", "NaT") else plain_cell(text)
 
@@ -362,9 +360,9 @@ def class_notes(table: Table, columns: Iterable[str], numbers: Collection[str] =
     """Return sentences on the classes in some columns of a table.
 
     Args:
-        table: with the columns.
-        columns: that are used as classes, whatever they contain, or as numbers.
-        numbers: those that are used as numbers.
+        table: table with the columns.
+        columns: columns that are used as classes, whatever they contain, or as numbers.
+        numbers: columns that are used as numbers.
 
     Raises:
         InputError: there is no such column.
@@ -379,11 +377,11 @@ def class_notes(table: Table, columns: Iterable[str], numbers: Collection[str] =
 def notes_on_classes(column: str, cells: Sequence[str], *, codes: bool = False) -> list[str]:
     """Return the number of shapes in each class, and sentences on classes that may be misspelt.
 
-    If more than half of all shapes are the only ones of their class, the column contains names and no counts are given.
+    If more than half of all shapes are alone in their class, the column contains names and no counts are given.
 
     Args:
-        column: its name.
-        cells: of all shapes; missing ones are empty.
+        column: name of the column.
+        cells: cells of all shapes; missing cells are empty.
         codes: whether numbers are codes of classes.
     """
     counts = Counter(cell for cell in cells if cell)
@@ -407,9 +405,9 @@ def notes_on_classes(column: str, cells: Sequence[str], *, codes: bool = False) 
             quoted_names = ", ".join(repr(name[:40]) for name in alone[:3]) + (" ..." if len(alone) > 3 else "")
             notes.append(
                 f"{column} has {len(alone)} {'class' if len(alone) == 1 else 'classes'} with one shape "
-                f"({quoted_names}); check the spelling, or leave these shapes out."
+                f"({quoted_names}); check the spelling, or exclude these shapes."
             )
-    for first, other, difference in _similar(list(counts), letters=not has_names):
+    for first, other, difference in _similar_pairs(list(counts), letters=not has_names):
         notes.append(
             f"{column} has the classes {first[:40]!r} ({counts[first]}) and {other[:40]!r} ({counts[other]}), which "
             f"differ only in {difference}; correct the table if they are the same."
@@ -418,12 +416,12 @@ def notes_on_classes(column: str, cells: Sequence[str], *, codes: bool = False) 
 
 
 def number_caution(table: Table, column: str, classes: str) -> str:
-    """Return a sentence on a column of few different whole numbers that is used as a number; empty on other columns.
+    """Return a sentence on a column of few different integers that is used as a number; empty for other columns.
 
     Args:
-        table: with the column.
-        column: of numbers.
-        classes: what to write for classes.
+        table: table with the column.
+        column: name of a column of numbers.
+        classes: term to write in a formula if the numbers are classes.
     """
     values = {float(value) for value in table.numbers(column)}
     if not _FEWEST_CODES <= len(values) <= _LISTED or len(table) < 2 * len(values):
@@ -432,12 +430,12 @@ def number_caution(table: Table, column: str, classes: str) -> str:
         return ""
     listed = ", ".join(f"{value:g}" for value in sorted(values))
     return (
-        f"{column} has {len(values)} different whole numbers ({listed}) and is used as a number, with 1 degree of "
+        f"{column} has {len(values)} different integers ({listed}) and is used as a number, with 1 degree of "
         f"freedom; if they are codes of classes, write {classes}, with {len(values) - 1}."
     )
 
 
-def _similar(names: Sequence[str], *, letters: bool) -> list[tuple[str, str, str]]:
+def _similar_pairs(names: Sequence[str], *, letters: bool) -> list[tuple[str, str, str]]:
     """Return pairs of similar names, and their difference."""
     plain: dict[str, list[str]] = {}
     for name in names:
@@ -472,8 +470,8 @@ class Label:
     """Class, subject and intensity of one scan.
 
     Args:
-        text: its class, such as an expression; empty where the table has only its subject.
-        intensity: from 0 to 1, or None if the table has none.
+        text: class of the scan, such as an expression; empty if the table has only its subject.
+        intensity: intensity from 0 to 1; None if the table has none.
         subject: name of the subject, or empty.
     """
 
@@ -487,8 +485,8 @@ class Labels:
     """A table of labels.
 
     Args:
-        table: with a row for each scan.
-        labels: of the rows.
+        table: table with a row for each scan.
+        labels: labels of the rows.
     """
 
     table: Table
@@ -497,7 +495,7 @@ class Labels:
     __repr__ = short_repr
 
     def match(self, scans: Sequence[Sequence[str]], where: Path | str) -> tuple[list[Label | None], list[str]]:
-        """Return the label of each scan, None without a row, and the sentences of `match_rows`, whose errors it raises.
+        """Return the label of each scan, None without a row, and the notes of `match_rows`, whose errors it raises.
 
         Args:
             scans: names of each scan.
@@ -515,13 +513,13 @@ def read_labels(path: Path, *, of_subjects: bool = True, of_any: bool = False) -
     `intensity` and `subject` as well.
 
     Args:
-        path: the table.
-        of_subjects: use subjects as classes if the table has no column of classes.
-        of_any: use the first column of words with repeated values as classes, before subjects.
+        path: path of the table.
+        of_subjects: whether to use subjects as classes if the table has no column of classes.
+        of_any: whether to use the first column of words with repeated values as classes, before subjects.
 
     Raises:
-        FileError: it cannot be read.
-        FileFormatError: it is not such a table.
+        FileError: the file cannot be read.
+        FileFormatError: the file is no such table.
     """
     table = read_table(path)
     heads = list(table.columns)

@@ -25,7 +25,7 @@ from shapespace.types import FloatArray, Mesh
 TABLE = "bones.csv"
 GROUPS = ("coast", "island")
 """The second group has the longer snout."""
-EFFECT_MM = 4.0  # mm, by which the snout of one group is longer
+EFFECT_MM = 4.0  # mm, difference of the snout's length between the groups
 LEFT_ARCH_MM = 1.5
 """Mean difference of the protrusion of the left and the right arch."""
 
@@ -115,11 +115,11 @@ def write_bones(
     Each has triangles and a pose of its own, and noise; every third has a hole.
 
     Args:
-        folder: created when missing.
-        count: 2 to 10,000.
-        seed: a number of 0 or more.
-        effect_mm: how much longer the snout of the second group is.
-        progress: called after each.
+        folder: output folder; created if it does not exist.
+        count: number of skulls, 2 to 10,000.
+        seed: seed, 0 or more.
+        effect_mm: difference of the snout's length between the second and the first group, mm.
+        progress: function called after each skull.
 
     Raises:
         InputError: a count or an effect out of range.

@@ -1,6 +1,6 @@
 """Folders of labelled face scans: BU-3DFE, Bosphorus, and any folder with a `labels.csv`.
 
-The licensed sets are not shipped; what is known of their names comes from L. Yin et al., *A 3D Facial Expression
+The licensed sets are not shipped; their naming rules are taken from L. Yin et al., *A 3D Facial Expression
 Database For Facial Behavior Research*, FGR 2006, A. Savran et al., *Bosphorus Database for 3D Face Analysis*, BioID
 2008, and public code that reads them.
 """
@@ -21,10 +21,10 @@ from shapespace.io.meshes.mesh_io import MESH_ENDINGS
 from shapespace.io.tables.table_io import table_rows
 
 EXPRESSIONS = ("neutral", "anger", "disgust", "fear", "smile", "sadness", "surprise")
-"""The words of the studies, in the order in which they are listed."""
+"""Expressions of the studies, in the order in which they are listed."""
 
 KINDS = ("neutral", "expression", "action unit", "rotation", "occlusion")
-"""What a scan may show; only the first two are found unless others are asked for."""
+"""Kinds of scans; only the first two are returned by default."""
 
 BU3DFE_EXPRESSIONS: Mapping[str, str] = MappingProxyType(
     {
@@ -35,7 +35,7 @@ BU3DFE_EXPRESSIONS: Mapping[str, str] = MappingProxyType(
 """Code in a BU-3DFE name -> word."""
 
 BU3DFE_LEVELS: Mapping[str, float] = MappingProxyType({"00": 0.0, "01": 0.25, "02": 0.5, "03": 0.75, "04": 1.0})
-"""Level in a BU-3DFE name -> intensity; 00 is the neutral face and no other."""
+"""Level in a BU-3DFE name -> intensity; 00 occurs only for the neutral face."""
 
 BU3DFE_ANCESTRY: Mapping[str, str] = MappingProxyType(
     {
@@ -73,9 +73,9 @@ LABELS = "labels.csv"
 
 _BU3DFE = re.compile(r"([FM]\d{4})_([A-Z]{2})(\d{2})([A-Z]{2})(?:_(F3D|RAW))?", re.IGNORECASE)
 _BOSPHORUS = re.compile(r"(bs\d{3})_([A-Z]+)_([A-Z0-9]+)_(\d+)", re.IGNORECASE)
-# The face cut out by the database's authors before the whole scan, with ears, hair and collar.
+# The face cut out by the database's authors is preferred to the complete scan with ears, hair and collar.
 _PARTS = ("F3D", "", "RAW")
-_SHOWN = 3  # names in a message before the rest is only counted
+_SHOWN = 3  # number of names in a message before the rest is only counted
 
 
 @dataclass(frozen=True)
@@ -83,8 +83,8 @@ class ScanEntry:
     """A scan with its subject and expression.
 
     Args:
-        path: the file.
-        subject: whose face it is, as the set names people.
+        path: path of the file.
+        subject: subject of the scan, as the set names people.
         expression: one of `EXPRESSIONS`; another word of `labels.csv`; the code of an action unit, a rotation or an
             occlusion, such as `LFAU_12`.
         intensity: 0 for neutral, up to 1.
@@ -111,10 +111,10 @@ class ScanSet:
     """Labelled scans of a folder.
 
     Args:
-        folder: the folder.
-        layout: "BU-3DFE", "Bosphorus" or "labels.csv".
-        scans: by subject, expression, intensity and path.
-        left_out: everything that looks like a scan and is not among `scans`.
+        folder: folder of the scans.
+        layout: layout of the folder: "BU-3DFE", "Bosphorus" or "labels.csv".
+        scans: labelled scans, sorted by subject, expression, intensity and path.
+        left_out: excluded files that look like scans, with the reasons.
     """
 
     folder: Path
@@ -123,12 +123,12 @@ class ScanSet:
     left_out: tuple[LeftOut, ...]
 
     def subjects_without_neutral(self) -> tuple[str, ...]:
-        """Return the people of whom there is no neutral scan, in order."""
+        """Return the people without a neutral scan, in order."""
         neutral = {scan.subject for scan in self.scans if scan.kind == "neutral"}
         return tuple(dict.fromkeys(scan.subject for scan in self.scans if scan.subject not in neutral))
 
     def summary(self) -> str:
-        """Return lines for people: how many scans of what, what was left out and why, who has no neutral scan."""
+        """Return lines on the number of scans of each expression, excluded scans and why, and missing neutrals."""
         words = Counter(scan.expression for scan in self.scans)
         people = len({scan.subject for scan in self.scans})
         counts = ", ".join(f"{word} {words[word]}" for word in sorted(words, key=_order))
@@ -138,7 +138,7 @@ class ScanSet:
         reasons: dict[str, list[str]] = {}
         for left in self.left_out:
             reasons.setdefault(left.why, []).append(left.name)
-        lines += [f"Left out, {reason}: {_list_names(names)}." for reason, names in reasons.items()]
+        lines += [f"Excluded, {reason}: {_list_names(names)}." for reason, names in reasons.items()]
         if alone := self.subjects_without_neutral():
             lines.append(f"No neutral scan: {_list_names(alone)}.")
         unlisted_names = {scan.expression for scan in self.scans if scan.kind == "expression"} - set(EXPRESSIONS)
@@ -148,38 +148,38 @@ class ScanSet:
 
 
 def find_scans(folder: Path | str, kinds: Collection[str] = ("neutral", "expression")) -> tuple[ScanEntry, ...]:
-    """Return the labelled scans in `folder` and below; `scan_set` tells what was left out, too.
+    """Return the labelled scans in `folder` and below; `scan_set` also returns the excluded files.
 
     Args:
         folder: BU-3DFE (`F0001/F0001_AN01WH_F3D.wrl`), Bosphorus (`bs000/bs000_E_HAPPY_0.bnt`), or with `labels.csv`.
-        kinds: which of `KINDS` to return.
+        kinds: kinds of scans to return, from `KINDS`.
 
     Returns:
-        By subject, expression, intensity and path; never empty.
+        The scans by subject, expression, intensity and path; never empty.
 
     Raises:
         FileError: the folder or its `labels.csv` cannot be read.
-        InputError: no such scans are in it, it mixes both databases, or `labels.csv` is not laid out as it should be.
+        InputError: the folder contains no such scans, it mixes both databases, or `labels.csv` has a wrong layout.
     """
     return scan_set(folder, kinds).scans
 
 
 def scan_set(folder: Path | str, kinds: Collection[str] = ("neutral", "expression")) -> ScanSet:
-    """Return the labelled scans in `folder` and below, and what was left out.
+    """Return the labelled scans in `folder` and below, and the excluded files.
 
-    With a `labels.csv` (file, subject, expression, and intensity if known) in `folder`, it alone counts. Otherwise
-    names are read. Of several files of the same BU-3DFE scan, `_F3D` (the face, cut out) is taken before a name
-    without part and before `_RAW` (the whole scan); of equal ones, `.wrl` before other endings, then
-    the first path. Of the same Bosphorus scan, `.bnt` is taken before other endings. The number at the end of a
-    Bosphorus name counts repeated takes, which are scans of their own.
+    If `folder` contains a `labels.csv` (file, subject, expression, and intensity if known), only this table is used.
+    Otherwise names are parsed. Of several files of the same BU-3DFE scan, `_F3D` (the face, cut out) is preferred to a
+    name without part, and that to `_RAW` (the complete scan); of equal ones, `.wrl` is preferred to other endings, then
+    the first path. Of the same Bosphorus scan, `.bnt` is preferred to other endings. The number at the end of a
+    Bosphorus name counts repeated takes, which are separate scans.
 
     Args:
-        folder: the folder.
-        kinds: which of `KINDS` to return.
+        folder: folder of the scans.
+        kinds: kinds of scans to return, from `KINDS`.
 
     Raises:
         FileError: the folder or its `labels.csv` cannot be read.
-        InputError: no such scans are in it, it mixes both databases, or `labels.csv` is not laid out as it should be.
+        InputError: the folder contains no such scans, it mixes both databases, or `labels.csv` has a wrong layout.
     """
     folder = Path(folder)
     unknown = [kind for kind in kinds if kind not in KINDS]
@@ -197,18 +197,18 @@ def scan_set(folder: Path | str, kinds: Collection[str] = ("neutral", "expressio
         else:
             left_out.append(LeftOut(_relative_name(scan.path, folder), f"not asked for ({scan.kind})"))
     if not scans:
-        raise InputError(f"{folder} holds no scans of kind {' or '.join(kinds)}; choose other kinds or folders.")
+        raise InputError(f"{folder} contains no scans of kind {' or '.join(kinds)}; choose other kinds or folders.")
     return ScanSet(folder, layout, tuple(scans), tuple(left_out))
 
 
 def _meshes_in(folder: Path) -> list[Path]:
-    def refuse(error: OSError) -> None:
+    def raise_error(error: OSError) -> None:
         raise read_error(Path(error.filename or folder), error) from error
 
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is a file, not a folder of scans; give the folder.")
     meshes: list[Path] = []
-    for home, inner, names in os.walk(folder, onerror=refuse):
+    for home, inner, names in os.walk(folder, onerror=raise_error):
         inner[:] = sorted(name for name in inner if not name.startswith("."))
         meshes += [
             Path(home) / name
@@ -229,7 +229,7 @@ def _from_names(folder: Path, files: Iterable[Path]) -> tuple[str, list[ScanEntr
     for path in files:
         recognised = next(((layout, read) for layout, reader in readers.items() if (read := reader(path))), None)
         if recognised is None:
-            left_out.append(LeftOut(_relative_name(path, folder), "the name says nothing known"))
+            left_out.append(LeftOut(_relative_name(path, folder), "a name of unknown form"))
             continue
         layout, (entry, key, rank) = recognised
         layouts.setdefault(layout, path)
@@ -245,11 +245,11 @@ def _from_names(folder: Path, files: Iterable[Path]) -> tuple[str, list[ScanEntr
     if len(layouts) > 1:
         first, second = (_relative_name(path, folder) for path in layouts.values())
         raise InputError(
-            f"{folder} holds scans of {' and '.join(layouts)} ({first}, {second}); give the folder of one of them."
+            f"{folder} contains scans of {' and '.join(layouts)} ({first}, {second}); give the folder of one set."
         )
     if not layouts:
         raise InputError(
-            f"{folder} holds no labelled scans: no {LABELS}, and no names as in BU-3DFE (F0001_AN01WH_F3D.wrl) or "
+            f"{folder} contains no labelled scans: no {LABELS}, and no names as in BU-3DFE (F0001_AN01WH_F3D.wrl) or "
             "Bosphorus (bs000_E_HAPPY_0.bnt); check the folder."
         )
     return next(iter(layouts)), [entry for _, entry in best.values()], left_out
@@ -312,7 +312,7 @@ def _from_labels(folder: Path, files: Iterable[Path]) -> tuple[list[ScanEntry], 
         cells = dict(zip(header, row, strict=False))
         entry = _entry_of_row(cells, f"{path}, line {line}", folder)
         row_name = f"{cells['file']} (line {line})"
-        target = _existing(entry.path)
+        target = _resolve_existing(entry.path)
         if target is None:
             left_out.append(LeftOut(row_name, "no such file"))
         elif target in entries:
@@ -328,11 +328,11 @@ def _from_labels(folder: Path, files: Iterable[Path]) -> tuple[list[ScanEntry], 
     return list(entries.values()), left_out
 
 
-def _existing(path: Path) -> Path | None:
+def _resolve_existing(path: Path) -> Path | None:
     try:
         return path.resolve() if path.is_file() else None
     except (OSError, ValueError, RuntimeError):
-        # Names too long, with null characters, or that go round in circles.
+        # Names that are too long, contain null characters, or form a cycle of links.
         return None
 
 
@@ -348,7 +348,7 @@ def _entry_of_row(cells: Mapping[str, str], row_name: str, folder: Path) -> Scan
         intensity = float(text)
     except ValueError:
         intensity = -1.0
-    # Not a number fails this comparison, too.
+    # NaN fails this comparison, too.
     if not 0 <= intensity <= 1:
         raise InputError(f"{row_name} has the intensity '{text[:40]}', which is no number from 0 to 1; correct it.")
     kind = "neutral" if neutral else "expression"

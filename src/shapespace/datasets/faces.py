@@ -65,16 +65,16 @@ EXPRESSIONS: Mapping[str, Mapping[str, float]] = MappingProxyType(
         },
     }
 )  # fmt: skip
-"""Name -> {unit: weight at full intensity}; a unit without its side stands for both sides."""
+"""Name -> {unit: weight at full intensity}; a unit without a side applies to both sides."""
 
-# How far each kind of detail may stray: the standard deviation of its weight, whose bound is 2.5 of them.
+# Standard deviation of the weights of each kind of detail; weights are bounded by 2.5 standard deviations.
 _SPREAD = {
     "asym": 0.05, "cheek": 0.22, "chin": 0.18, "ear": 0.20, "eyebrows": 0.18, "eye": 0.22, "forehead": 0.06,
     "head": 0.10, "mouth": 0.20, "neck": 0.08, "nose": 0.19,
 }  # fmt: skip
 _SIDE_SPREAD = 0.03  # standard deviation of the difference between left and right
 _FACE_MM = 110.0
-"""A face alone reaches as far from the tip of the nose."""
+"""Largest distance of the vertices of a face without the head from the tip of the nose, mm."""
 _OPPOSITES = {
     "decr": "incr", "down": "up", "in": "out", "backward": "forward", "concave": "convex", "compress": "uncompress",
 }  # fmt: skip
@@ -87,8 +87,9 @@ class Person:
 
     Args:
         weights: (I,) float64 in [0, 1], one for each of the generator's `identity_names`.
-        name: used in the names of meshes.
-        warp_mm: (C, 3) what none of those shapes makes, on the generator's vertices before subdivision; None for none.
+        name: name of the person, used in the names of meshes.
+        warp_mm: (C, 3) displacements outside the span of those shapes, on the generator's vertices before subdivision,
+            mm; None for none.
     """
 
     weights: FloatArray
@@ -98,7 +99,7 @@ class Person:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "weights", _checked_weights(self.weights, "person"))
+        object.__setattr__(self, "weights", _check_weights(self.weights, "person"))
         if self.warp_mm is not None:
             object.__setattr__(self, "warp_mm", read_only(self.warp_mm))
 
@@ -120,10 +121,10 @@ class Expression:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "weights", _checked_weights(self.weights, "expression"))
+        object.__setattr__(self, "weights", _check_weights(self.weights, "expression"))
 
 
-def _checked_weights(weights: npt.ArrayLike, weight_kind: str) -> FloatArray:
+def _check_weights(weights: npt.ArrayLike, weight_kind: str) -> FloatArray:
     out = read_only(weights)
     if out.ndim != 1 or not np.isfinite(out).all() or (out < 0).any() or (out > 1).any():
         raise InputError(f"The weights of a simulated {weight_kind} must be a list of numbers from 0 to 1.")
@@ -140,7 +141,7 @@ class FaceGenerator:
         landmarks: name -> vertex.
         regions: name -> (n,) int32 vertices; semi_rigid, eyes, mouth, ears, nose, boundary, eyeballs, mouth_interior.
         identity_names: the I shapes that make a person.
-        unit_names: the U = 52 units that make an expression; mouthClose only makes sense against an open jaw, and
+        unit_names: the U = 52 units that make an expression; mouthClose only makes sense with an open jaw, and
             tongueOut moves nothing, since the surface has no tongue.
 
     Example:
@@ -164,13 +165,13 @@ class FaceGenerator:
     __repr__ = short_repr
 
     def draw_person(self, rng: np.random.Generator | int, name: str = "person", *, wide: bool = False) -> Person:
-        """Draw a plausible adult: bounded weights, symmetric but for a small asymmetry.
+        """Draw a plausible adult: bounded weights, symmetric except for a small asymmetry.
 
         Args:
-            rng: generator or seed, the only source of chance.
-            name: used in the names of the person's meshes.
-            wide: whether the same person also differs by smooth changes at every scale (`Warp`), as real people do:
-                a model of such people follows real faces where one of the others is too narrow.
+            rng: generator or seed, the only source of randomness.
+            name: name of the person, used in the names of the meshes.
+            wide: whether the same person also differs by smooth changes at every scale (`Warp`), as real people do: a
+                model of such people represents real faces for which a model of the other people is too narrow.
         """
         rng = generator_of(rng, "draw_person")
         weights = dict.fromkeys(self.identity_names, 0.0)
@@ -192,7 +193,7 @@ class FaceGenerator:
             sides = ("left_", "right_") if decrease.startswith("left_") else ("",)
             lopsided = decrease.startswith("left_asym")
             for side in sides:
-                # An asymmetry target is drawn for each side by itself; every other pair of sides shares its weight.
+                # An asymmetry target is drawn for each side separately; every other pair of sides shares its weight.
                 x = _draw_bounded_factor(rng, spread) if lopsided else shared
                 if side and not lopsided:
                     x = float(np.clip(x + _draw_bounded_factor(rng, _SIDE_SPREAD), -2.5 * spread, 2.5 * spread))
@@ -226,13 +227,13 @@ class FaceGenerator:
     def draw_expression(
         self, name: str, intensity: float, rng: np.random.Generator | int, variation: float = 0.12
     ) -> Expression:
-        """Draw one way of showing an expression.
+        """Draw a random variant of an expression.
 
         Args:
             name: one of `EXPRESSIONS`.
-            intensity: from 0 (neutral) to 1.
-            rng: generator or seed, the only source of chance.
-            variation: how much each unit varies from one drawing to the next, as a share of its weight.
+            intensity: intensity from 0 (neutral) to 1.
+            rng: generator or seed, the only source of randomness.
+            variation: standard deviation of each unit between drawings, as a share of its weight.
 
         Raises:
             InputError: unknown name, or an intensity outside [0, 1].
@@ -246,8 +247,8 @@ class FaceGenerator:
         """Draw a mixture of the six expressions, each at its own intensity, for a training set of one person.
 
         Args:
-            rng: generator or seed, the only source of chance.
-            variation: how much each unit varies, as a share of its weight.
+            rng: generator or seed, the only source of randomness.
+            variation: standard deviation of each unit, as a share of its weight.
         """
         rng = generator_of(rng, "mixed_expression")
         names = [n for n in EXPRESSIONS if n != "neutral"]
@@ -274,9 +275,9 @@ class FaceGenerator:
         """Return the surface of a person with an expression, in mm, with all landmarks.
 
         Args:
-            person: from this generator.
-            expression: from this generator; neutral when left out.
-            name: of the mesh; made from the two when left out.
+            person: person of this generator.
+            expression: expression of this generator; None for neutral.
+            name: name of the mesh; None for one made from person and expression.
 
         Raises:
             InputError: weights, or a warp, of the wrong number.
@@ -303,9 +304,9 @@ class FaceGenerator:
         return Mesh(vertices, self.template.faces, points, title)
 
     def cut_to_face(self, mesh: Mesh) -> Mesh:
-        """Return the face alone of a surface of this generator, always the same part: no ears, crown, nape and neck.
+        """Return only the face of a surface of this generator, always the same part: no ears, crown, nape and neck.
 
-        Models of it follow scans that show hair, a collar or no more than the face.
+        Models of it can be fitted to scans that show hair, a collar or only the face.
         """
         used, triangles = self._face_part
         left = mesh.vertices[used]
@@ -313,7 +314,7 @@ class FaceGenerator:
 
     @cached_property
     def face_landmarks(self) -> Mapping[str, int]:
-        """Name -> vertex of the landmarks that lie in what `cut_to_face` leaves, in its numbers."""
+        """Name -> vertex of the landmarks on the part of `cut_to_face`, in its numbering."""
         number = {int(v): k for k, v in enumerate(self._face_part[0])}
         return MappingProxyType({name: number[v] for name, v in self.landmarks.items() if v in number})
 
@@ -420,8 +421,8 @@ class Warp:
     """Amplitude and length scales of a random deformation, mm for a head.
 
     The shape is stretched along its axes, and displaced by Gaussian processes with squared-exponential covariance, each
-    a sum of cosine waves in space (random Fourier features: Rahimi and Recht, NIPS 2007). No triangle turns over while
-    the amplitude of a field is far below its length scale.
+    a sum of cosine waves in space (random Fourier features: Rahimi and Recht, NIPS 2007). No triangle is inverted as
+    long as the amplitude of a field is far below its length scale.
 
     Args:
         stretch: standard deviation of the logarithm of the stretch along each axis; the volume stays.
@@ -437,9 +438,9 @@ class Warp:
         """Draw displacements (V, 3) of the vertices `x` (V, 3), mm.
 
         Args:
-            x: x to the left, so that a change of sign mirrors it.
+            x: (V, 3) vertices, x to the left, so that a change of sign mirrors them.
             mirror: (V,) the vertex on the other side.
-            rng: the only source of chance.
+            rng: the only source of randomness.
         """
         stretch = np.exp(self.stretch * rng.standard_normal(3))
         out = x * (stretch / stretch.prod() ** (1 / 3) - 1.0)
@@ -451,7 +452,7 @@ class Warp:
 
 
 def _field(x: FloatArray, length_mm: float, rng: np.random.Generator) -> FloatArray:
-    """Return (V, 3) of variance 1 along each axis, smooth over `length_mm`."""
+    """Return a random field (V, 3) of variance 1 along each axis, smooth over `length_mm`."""
     waves, phases = rng.standard_normal((_WAVES, 3)) / length_mm, rng.uniform(0.0, 2.0 * np.pi, _WAVES)
     heights = rng.standard_normal((_WAVES, 3))
     return np.asarray(np.sqrt(2.0 / _WAVES) * np.cos(x @ waves.T + phases) @ heights, dtype=np.float64)
@@ -462,7 +463,7 @@ _CHIN_WIDTH_MM = 12.0  # mm, standard deviation of the Gaussian around the pogon
 
 
 def chin_of(faces: FaceGenerator) -> FloatArray:
-    """Return (V,) how much of the chin each vertex is: 1 at its tip, with a smooth edge."""
+    """Return the (V,) weight of the chin at each vertex: 1 at its tip, with a smooth edge."""
     template = faces.template.vertices
     distance = np.linalg.norm(template - template[faces.landmarks["pogonion"]], axis=1)
     return np.exp(-0.5 * (distance / _CHIN_WIDTH_MM) ** 2)
@@ -496,24 +497,25 @@ def write_faces(
     Subject k is the same person whatever the number of subjects, and looks the same whatever the other expressions.
 
     Args:
-        folder: created when missing.
-        subjects: how many people, 1 to 100,000.
-        expressions: names out of `EXPRESSIONS`, each drawn once per person.
-        seed: a number of 0 or more.
-        raw: as a scanner would give them, by `plain_scan`; there is then no landmarks.csv, since no vertex is the same.
+        folder: output folder; created if it does not exist.
+        subjects: number of people, 1 to 100,000.
+        expressions: names from `EXPRESSIONS`, each drawn once per person.
+        seed: seed, 0 or more.
+        raw: whether to write raw scans (`plain_scan`) instead of surfaces in correspondence; there is then no
+            landmarks.csv, since the vertices do not correspond.
         wide: whether people vary as widely as real ones; see `FaceGenerator.draw_person`.
-        face_only: whether to leave out ears, crown, nape and neck; see `FaceGenerator.cut_to_face`.
-        intensities: of the expressions, of which one is drawn for each; 1 is full.
-        effect_mm: gives each a sex and an age in labels.csv, and men a chin that stands out by so much more, for trying
-            comparisons of groups: nothing else goes with sex, and nothing with age.
-        progress: called with (files written, files in all).
+        face_only: whether to omit ears, crown, nape and neck; see `FaceGenerator.cut_to_face`.
+        intensities: intensities of the expressions, from which one is drawn for each expression; 1 is full.
+        effect_mm: protrusion of the chin of men, mm, for tests of group comparisons; labels.csv then has a sex and an
+            age, and nothing else depends on sex, and nothing on age. None for no such effect.
+        progress: function called with (files written, files in all).
 
     Returns:
         The folder.
 
     Raises:
-        InputError: no subjects, too many, a negative seed, an unknown or repeated expression, or such intensities or
-            effects.
+        InputError: no subjects, too many, a negative seed, an unknown or repeated expression, or intensities or effects
+            out of range.
         FileError: the folder cannot be written.
     """
     known = list(EXPRESSIONS)

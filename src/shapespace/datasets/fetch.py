@@ -1,9 +1,9 @@
 """Open data sets: location, published hashes, and download.
 
-A data set is looked for in this order: the local mirror that `SHAPESPACE_DATA` names (a folder holding `<name>/`),
-the cache folder of the platform (or `SHAPESPACE_CACHE`), and then the network: the published
-repository at a pinned commit, or the server that `SHAPESPACE_DATA_URL` names, laid out like a local mirror.
-Nothing is used before it is verified, and a file that is cut short is never taken for whole.
+A data set is searched for in this order: the local mirror that `SHAPESPACE_DATA` names (a folder that contains
+`<name>/`), the cache folder of the platform (or `SHAPESPACE_CACHE`), and then the network: the published
+repository at a pinned commit, or the server that `SHAPESPACE_DATA_URL` names, with the layout of a local mirror.
+Nothing is used before it is verified, and a truncated file is never used.
 
 James is checked by the SHA-256 of each file. ICT-FaceKit is 158 OBJ files (400 MB); they are checked one by one by
 the SHA-256 of their content (see `ict_files`), packed into one `.npz` (11 MB) in the cache, and then deleted.
@@ -38,9 +38,9 @@ from shapespace.errors import DataError
 from shapespace.io.disk_cache import cache_folder
 from shapespace.io.files import atomic_path, make_folder, read_error, sha256_of_file, write_error, write_text
 
-_TYPICAL_OBJ_BYTES = 2_558_000  # bytes; an estimate for the progress bar where the registry has no size
+_TYPICAL_OBJ_BYTES = 2_558_000  # bytes; an estimate for the progress bar if the registry has no size
 _LICENCE_NAME = "LICENSE.txt"
-# A mesh is of no use without these; its material and picture are taken along where they are.
+# Files that a mesh does not need, its material and picture; they are copied if they exist.
 _OPTIONAL_SUFFIXES = (".mtl", ".jpg")
 
 
@@ -49,11 +49,11 @@ class DataFile:
     """One file of a data set.
 
     Args:
-        path: relative to the folder of the data set, with forward slashes.
-        remote: relative to the root of the published repository.
-        sha256: of the raw file, or None where only the content is known.
-        content_sha256: of the parsed content (see `ict_files`), or None.
-        bytes: size of the raw file, or None where it is not known.
+        path: path relative to the folder of the data set, with forward slashes.
+        remote: path relative to the root of the published repository.
+        sha256: SHA-256 of the raw file; None if only that of the content is known.
+        content_sha256: SHA-256 of the parsed content (see `ict_files`); None if not used.
+        bytes: size of the raw file, bytes; None if not known.
     """
 
     path: str
@@ -68,13 +68,13 @@ class Dataset:
     """An open data set as published.
 
     Args:
-        name: as in `shapespace data get NAME`.
-        title, licence, citation: for people.
-        licence_text: the full licence, written beside the files.
+        name: name of the data set, as in `shapespace data get NAME`.
+        title, licence, citation: descriptions for readers.
+        licence_text: complete licence, written next to the files.
         repository: `owner/name` on GitHub.
-        commit: 40 hexadecimal digits; the files are those of this commit.
-        files: every file of it that is downloaded.
-        packed: name of the one file that stands for all of them once converted, or None.
+        commit: commit of the files, 40 hexadecimal digits.
+        files: files that are downloaded.
+        packed: name of the single file that replaces all of them after conversion; None without conversion.
     """
 
     name: str
@@ -89,17 +89,17 @@ class Dataset:
 
     @property
     def published_url(self) -> str:
-        """The address below which the published files lie, with a slash at the end."""
+        """The address of the folder of the published files, with a slash at the end."""
         return f"https://raw.githubusercontent.com/{self.repository}/{self.commit}/"
 
     @property
     def download_bytes(self) -> int:
-        """How much a download moves; a good estimate where sizes are not known."""
+        """Size of the download, bytes; an estimate if sizes are not known."""
         return sum(file.bytes or _TYPICAL_OBJ_BYTES for file in self.files)
 
     @property
     def sha256(self) -> str:
-        """One hash for the whole set: the SHA-256 of the names and hashes of its files, a line each."""
+        """One hash for the complete set: the SHA-256 of the names and hashes of its files, one line each."""
         lines = sorted(f"{file.path} {file.sha256 or file.content_sha256}\n" for file in self.files)
         return hashlib.sha256("".join(lines).encode()).hexdigest()
 
@@ -127,14 +127,14 @@ def _read_registry() -> Mapping[str, Dataset]:
 
 
 DATASETS: Mapping[str, Dataset] = _read_registry()
-"""Every open data set that can be got, by name."""
+"""Available open data sets, by name."""
 
 
 def dataset(name: str) -> Dataset:
-    """Return the data set called `name`.
+    """Return the data set named `name`.
 
     Raises:
-        DataError: there is none of that name.
+        DataError: there is no data set of that name.
     """
     if name not in DATASETS:
         raise DataError(f"There is no data set {name!r}; there are: {', '.join(DATASETS)}.")
@@ -142,48 +142,47 @@ def dataset(name: str) -> Dataset:
 
 
 def data_folder(name: str | Dataset, *, cache: Path | None = None) -> Path | None:
-    """Return the folder that holds a whole data set, from the mirror or the cache, or None; never downloads.
+    """Return the folder of a complete data set, from the mirror or the cache; None without it. Never downloads.
 
-    Files are looked for by name here; their hashes are checked by `data_get` and by the loaders.
+    Files are searched for by name here; their hashes are checked by `data_get` and by the loaders.
 
     Args:
-        name: of the data set, or the data set itself.
-        cache: instead of `cache_folder()`.
+        name: name of the data set, or the data set itself.
+        cache: folder to use instead of `cache_folder()`.
 
     Raises:
-        DataError: there is no data set of that name, or the mirror has a part of it only.
+        DataError: there is no data set of that name, or the mirror is incomplete.
     """
     data_set = dataset(name) if isinstance(name, str) else name
     mirror = _mirror_folder(data_set)
     if mirror is not None:
         return mirror
     cached = (cache or cache_folder()) / data_set.name
-    return None if _missing(data_set, cached) else cached
+    return None if _missing_files(data_set, cached) else cached
 
 
 def present_folder(name: str, purpose: str) -> Path:
-    """Return the verified folder of a data set that is here already; never downloads.
+    """Return the verified folder of a data set in the mirror or the cache; never downloads.
 
     Args:
-        name: as in `DATASETS`.
-        purpose: its name for people.
+        name: name of the data set in `DATASETS`.
+        purpose: name of the data set in messages.
 
     Raises:
-        DataError: it is not here, or does not match its hashes.
+        DataError: it is neither in the mirror nor in the cache, or does not match its hashes.
     """
     if data_folder(name) is None:
         raise DataError(
-            f"{purpose} is not here; run `shapespace data get {name}`, or set SHAPESPACE_DATA to a folder that holds "
-            f"{name}/."
+            f"{purpose} is not here; run `shapespace data get {name}`, or set SHAPESPACE_DATA to a folder with {name}/."
         )
     return data_get(name)
 
 
 def data_list(*, cache: Path | None = None) -> list[dict[str, object]]:
-    """Return the facts of every data set as plain values, with where it is: `mirror`, `cache` or `not here`.
+    """Return the facts of every data set as plain values, with its location: `mirror`, `cache` or `not here`.
 
     Args:
-        cache: instead of `cache_folder()`.
+        cache: folder to use instead of `cache_folder()`.
     """
     facts: list[dict[str, object]] = []
     for name, entry in DATASETS.items():
@@ -220,15 +219,15 @@ def data_get(
     base_url: str | None = None,
     cache: Path | None = None,
 ) -> Path:
-    """Return the folder of a data set whose files are all there and verified, downloading it if need be.
+    """Return the folder of a data set with all files verified; download it if necessary.
 
     Args:
-        name: of the data set, or the data set itself.
-        to: copy the verified files to `to/<name>/` and return that; `to` can then serve as a mirror.
-        progress: show a bar on standard error; None shows it on a terminal only.
-        base_url: a server laid out like a local mirror (`<base_url>/<name>/...`), instead of
+        name: name of the data set, or the data set itself.
+        to: folder for a copy of the verified files, `to/<name>/`, which is returned; `to` can then serve as a mirror.
+        progress: whether to show a bar on standard error; None shows it on a terminal only.
+        base_url: server with the layout of a local mirror (`<base_url>/<name>/...`), instead of
             `SHAPESPACE_DATA_URL` or the published repository.
-        cache: instead of `cache_folder()`.
+        cache: folder to use instead of `cache_folder()`.
 
     Raises:
         DataError: unknown name, a file that does not match its hash, an incomplete mirror, or no network.
@@ -242,7 +241,7 @@ def data_get(
     else:
         make_folder(root / data_set.name)
         with hold_lock(root / f".{data_set.name}.lock"):
-            # Another process may have finished it while this one waited.
+            # Another process may have finished it during the wait for the lock.
             if data_folder(data_set, cache=root) is None:
                 _download_all(data_set, root / data_set.name, base_url, progress)
             folder = _verify(data_set, root / data_set.name, root)
@@ -253,7 +252,7 @@ def _mirror_folder(data_set: Dataset) -> Path | None:
     configured = os.environ.get("SHAPESPACE_DATA")
     if not configured or not (folder := Path(configured) / data_set.name).is_dir():
         return None
-    missing = _missing(data_set, folder)
+    missing = _missing_files(data_set, folder)
     if missing:
         raise DataError(
             f"{folder}, named by SHAPESPACE_DATA, lacks {len(missing)} of the files of {data_set.name} "
@@ -262,7 +261,7 @@ def _mirror_folder(data_set: Dataset) -> Path | None:
     return folder
 
 
-def _missing(data_set: Dataset, folder: Path) -> list[str]:
+def _missing_files(data_set: Dataset, folder: Path) -> list[str]:
     if data_set.packed and (folder / data_set.packed).is_file():
         return []
     required = [f.path for f in data_set.files if not f.path.endswith(_OPTIONAL_SUFFIXES)]
@@ -344,7 +343,7 @@ def _download_all(data_set: Dataset, folder: Path, base_url: str | None, progres
 
 
 def _fetch_packed(data_set: Dataset, address: str, folder: Path, bar: tqdm[Any]) -> bool:
-    """Get the packed file from a server of our own; False if it has none. Its content is verified all the same."""
+    """Download the packed file from a server of our own; False if it has none. Its content is verified too."""
     assert data_set.packed
     path = folder / f"unverified.{data_set.packed}"
     try:
@@ -362,7 +361,7 @@ def _fetch_packed(data_set: Dataset, address: str, folder: Path, bar: tqdm[Any])
 
 
 def _fetch_obj(file: DataFile, url: str, path: Path, neutral: Any, bar: tqdm[Any]) -> None:
-    """Get one OBJ file and check its content; one that is already there from a broken run is checked first."""
+    """Download one OBJ file and check its content; a file of an interrupted run is checked first."""
     assert file.content_sha256
     if path.is_file():
         try:
@@ -385,25 +384,25 @@ def _fetch_obj(file: DataFile, url: str, path: Path, neutral: Any, bar: tqdm[Any
 
 # Downloads that resume after an interruption, and file locks between processes
 
-_ATTEMPTS = 3  # tries of one file; each resumes the one before
+_ATTEMPTS = 3  # number of tries of one file; each resumes the previous one
 _TIMEOUT_S = 30.0  # seconds without a byte
 _BLOCK = 1 << 16  # bytes (64 KiB), between updates of the progress bar
 _MAX_FILE_BYTES = 32 << 20  # 32 MiB, for files without a published size
 
 
 def download(url: str, path: Path, bar: tqdm[Any], *, sha256: str | None = None, size: int | None = None) -> None:
-    """Get one file, going on where a broken run stopped.
+    """Download one file, resuming an interrupted run.
 
     Args:
-        url: where it is.
-        path: where it goes.
-        bar: updated after each block.
-        sha256: what it must hash to, or None.
-        size: in bytes, or None where it is not known.
+        url: address of the file.
+        path: path of the downloaded file.
+        bar: progress bar, updated after each block.
+        sha256: expected SHA-256; None for no check.
+        size: expected size, bytes; None if not known.
 
     Raises:
-        DataError: there is no network, no such file (`NotThereError`), or it is not the one published.
-        FileError: it cannot be written.
+        DataError: there is no network, no such file (`NotThereError`), or it is not the published file.
+        FileError: the file cannot be written.
     """
     resuming = _ResumingDownload(path.with_name(f"{path.name}.part"), size, bar)
     try:
@@ -434,7 +433,7 @@ class _CutError(Exception):
 
 @dataclass(frozen=True)
 class _ResumingDownload:
-    """A downloader for pooch that keeps what it has in a `.part` file and asks only for the rest.
+    """A downloader for pooch that keeps received data in a `.part` file and requests only the rest.
 
     Pooch's own names for the arguments of the call are misleading: `fname` is the address, `action` the target.
     """
@@ -473,7 +472,7 @@ class _ResumingDownload:
                 reason = error
         cause = getattr(reason, "reason", None) or reason
         raise DataError(
-            f"Cannot download {fname} ({str(cause).strip('.')}), and {self.part.parent} does not hold it yet: "
+            f"Cannot download {fname} ({str(cause).strip('.')}), and {self.part.parent} does not contain it yet: "
             "check the network and run again, which resumes the download, or set SHAPESPACE_DATA to a local copy."
         ) from reason
 
@@ -525,7 +524,7 @@ class _ResumingDownload:
 
 @contextlib.contextmanager
 def _quiet_pooch() -> Generator[None]:
-    """Keep pooch from logging to standard error, where the progress bar is."""
+    """Suppress the log of pooch on standard error, where the progress bar is."""
     logger = pooch.get_logger()
     level = logger.level
     logger.setLevel(logging.WARNING)
@@ -537,7 +536,7 @@ def _quiet_pooch() -> Generator[None]:
 
 @contextlib.contextmanager
 def hold_lock(path: Path) -> Generator[None]:
-    """Hold a lock on the file `path`; the system releases it even if the process is killed."""
+    """Lock the file `path`; the system releases the lock even if the process is killed."""
     try:
         stream = path.open("a+b")
     except OSError as error:

@@ -127,7 +127,7 @@ class IctFaces:
                 the mean.
             expression: name -> intensity, 0 to 1 as published; names of `expression_names`.
             area: `face` (9,409 vertices) or `face_and_head` (11,248 vertices).
-            name: of the mesh.
+            name: name of the mesh.
 
         Raises:
             InputError: too many coefficients, numbers that are not finite, an unknown expression or area.
@@ -187,10 +187,10 @@ def landmark_vertices(area: Area) -> dict[str, int]:
 
 
 def ict_available() -> bool:
-    """Whether the mirror or the cache holds ICT-FaceKit; never downloads.
+    """Return whether the mirror or the cache contains ICT-FaceKit; never downloads.
 
     Raises:
-        DataError: the mirror holds a part of it only.
+        DataError: the mirror is incomplete.
     """
     return fetch.data_folder(NAME) is not None
 
@@ -199,8 +199,8 @@ def load_ict(folder: Path | None = None) -> IctFaces:
     """Return the ICT face model, from the packed `.npz` or from the published OBJ files.
 
     Args:
-        folder: holds `ict_face_and_head.npz`, or `FaceXModel/` with the published OBJ files, or is that folder; as
-            many modes as it holds are loaded. None takes the mirror or the cache, verified, and never downloads.
+        folder: folder with `ict_face_and_head.npz`, or with `FaceXModel/` of the published OBJ files, or that folder
+            itself; all its modes are loaded. None for the mirror or the cache, verified; never downloads.
 
     Raises:
         DataError: `folder` is None and the data are not here or do not match their hashes, or `folder` has neither
@@ -249,14 +249,15 @@ def write_people(
     `landmarks.csv` (name, vertex).
 
     Args:
-        folder: created if need be.
-        subjects: how many people.
-        seed: of their coefficients; the first people are the same whatever `subjects` is.
+        folder: output folder; created if necessary.
+        subjects: number of people.
+        seed: seed of their coefficients; the first people do not depend on `subjects`.
         area: `face` or `face_and_head`.
         expressions: names of `EXPRESSIONS` or of the published expressions, at full intensity.
-        raw: as a scanner would give them, by `plain_scan`; there is then no landmarks.csv, since no vertex is the same.
-        faces: the model; None loads it.
-        progress: called with (done, total) after each file.
+        raw: whether to write raw scans (`plain_scan`) instead of surfaces in correspondence; there is then no
+            landmarks.csv, since the vertices do not correspond.
+        faces: ICT face model; None loads it.
+        progress: function called with (done, total) after each file.
 
     Raises:
         InputError: no people or no expressions, or an unknown expression or area.

@@ -146,10 +146,10 @@ def _stack(modes: list[Float32Array]) -> Float32Array:
 
 
 def write_packed(path: Path, packed: PackedIct) -> None:
-    """Write `packed` to the `.npz` file `path`, whole or not at all.
+    """Write `packed` to the `.npz` file `path`, completely or not at all.
 
     Raises:
-        FileError: it cannot be written.
+        FileError: the file cannot be written.
     """
     with atomic_path(path) as temporary:
         np.savez_compressed(

@@ -14,10 +14,10 @@ NAME = "james"
 
 
 def james_available() -> bool:
-    """Whether the mirror or the cache holds James; never downloads.
+    """Return whether the mirror or the cache contains James; never downloads.
 
     Raises:
-        DataError: the mirror holds a part of it only.
+        DataError: the mirror is incomplete.
     """
     return fetch.data_folder(NAME) is not None
 
@@ -26,7 +26,7 @@ def load_james(folder: Path | None = None) -> Mesh:
     """Return James in mm, 6,393 vertices in colours and 12,228 triangles, with landmarks `chin_0` to `mouth_19`.
 
     Args:
-        folder: holds `james.obj` and `james.ljson`; None takes the mirror or the cache, verified, and never downloads.
+        folder: folder with `james.obj` and `james.ljson`; None for the mirror or the cache, verified. Never downloads.
 
     Raises:
         DataError: `folder` is None and James is not here or does not match its hash.

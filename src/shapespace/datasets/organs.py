@@ -39,12 +39,12 @@ class Organ:
     """One organ in its own frame, mm.
 
     Args:
-        half_mm: (3,) of its axes.
-        taper: how much wider one end is.
-        bend: how far it is bent, as a share of its half length.
+        half_mm: (3,) half lengths of its axes, mm.
+        taper: relative change of the width along x; a positive value widens the end at positive x.
+        bend: offset of the ends by bending, as a share of its half length.
         notch: (3,) direction of the notch in its border.
-        depth: of the notch and height of the ridge, as shares of the radius, (2,).
-        waves: (N,) logarithms of how far its surface goes up at directions spread evenly.
+        depth: (2,) depth of the notch and height of the ridge, as shares of the radius.
+        waves: (N,) logarithms of the relative radius of its surface at evenly spread directions.
     """
 
     half_mm: FloatArray
@@ -136,14 +136,14 @@ def write_organs(
     """Write organ_000.ply and so on as raw surfaces, or organ_000.nii.gz as label volumes; those are of one organ.
 
     Args:
-        folder: created when missing.
-        count: 1 to 10,000.
-        seed: a number of 0 or more.
-        volumes: write label volumes.
-        progress: called after each.
+        folder: output folder; created if it does not exist.
+        count: number of organs, 1 to 10,000.
+        seed: seed, 0 or more.
+        volumes: whether to write label volumes.
+        progress: function called after each organ.
 
     Raises:
-        InputError: a number that cannot be.
+        InputError: a number out of range.
         ShapespaceError: volumes, without the extra `volumes`.
         FileError: the folder cannot be written.
     """

@@ -1,7 +1,8 @@
 """Raw scans simulated from a known surface: new triangles, new pose and scale, noise, holes, hair and collar.
 
-What a real scanner does to a face, with the truth kept: where each vertex of the model truly lies in the scan. The
-frame of the given mesh must have y up and the face looking along +z, as all faces of this package have, in mm.
+The simulation reproduces the effects of a real scanner on a face and keeps the truth: the true position of each vertex
+of the model in the scan. The frame of the given mesh must have y up and the face looking along +z, as all faces of this
+package have, in mm.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from shapespace.reprs import short_repr
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity, generator_of, read_only, require
 
 PLAIN_TRIANGLES = 20_000
-"""Of a plain scan."""
+"""Number of triangles of a plain scan."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +32,8 @@ class Hole:
     """A ball cut out of the scan.
 
     Args:
-        radius_mm: of the ball, in the model's millimetres.
-        center: (3,) in the model's frame; None takes a random vertex of the surface.
+        radius_mm: radius of the ball, in the model's millimetres.
+        center: (3,) centre in the model's frame; None for a random vertex of the surface.
     """
 
     radius_mm: float
@@ -57,11 +58,11 @@ class SimulatedScan:
     """A simulated raw scan with the truth.
 
     Args:
-        scan: the surface as a scanner would give it: its own triangles and frame, no landmarks.
+        scan: surface as a scanner would return it: its own triangles and frame, no landmarks.
         truth_vertices: (V, 3) float64, the vertices of the model's mesh, in its order, in the frame of the scan.
         truth_landmarks: name -> (3,), the landmarks of the model's mesh in the frame of the scan.
-        T_scan_model: from the model's frame to the scan's.
-        on_surface: (S,) bool, which vertices of the scan belong to the true surface, and are no outliers.
+        T_scan_model: transformation from the model's frame to the scan's.
+        on_surface: (S,) bool, whether each vertex of the scan belongs to the true surface, and is no outlier.
 
     Example:
         >>> simulated = ss.datasets.simulate_scan(meshes[0], 0, triangles=2000)
@@ -87,10 +88,10 @@ def random_similarity(
     """Return a random similarity about the origin.
 
     Args:
-        rng: draws it.
-        max_angle_deg: the angle is uniform in [0, max] about a random axis.
-        scale_range: least and greatest scale, drawn evenly in its logarithm.
-        translation_mm: each coordinate is uniform in [-this, this].
+        rng: random generator of the transformation.
+        max_angle_deg: largest angle about a random axis, uniform in [0, max], degrees.
+        scale_range: smallest and largest scale, drawn uniformly in its logarithm.
+        translation_mm: largest absolute value of each coordinate of the translation, uniform, mm.
 
     Raises:
         InputError: a scale that is not positive.
@@ -124,17 +125,17 @@ def simulate_scan(
 
     Args:
         mesh: the true surface, in mm, y up and facing +z.
-        rng: generator or seed, from which every random choice comes.
-        triangles: of the re-triangulated surface, before anything is cut away or added.
+        rng: generator or seed, from which every random choice is made.
+        triangles: number of triangles of the re-triangulated surface, before anything is cut away or added.
         noise_mm: standard deviation of the noise along the normals, in mm of the model's frame.
         T_scan_model: pose and scale of the scan; None leaves it in the model's frame.
         holes: balls to cut out.
         crop: planes to cut with.
-        hair: to put on, or None.
-        collar: to put on, or None.
-        outlier_fraction: share of the vertices thrown 3 to 15 mm off the surface, either way.
-        split: as in `retriangulate`.
-        name: of the scan.
+        hair: hair to add; None for none.
+        collar: collar to add; None for none.
+        outlier_fraction: share of the vertices moved 3 to 15 mm off the surface, to either side.
+        split: whether all triangles are split first, see `retriangulate`.
+        name: name of the scan.
 
     Raises:
         InputError: an option out of range, or holes and cuts that leave nothing.
@@ -203,9 +204,10 @@ def retriangulate(
 
     Args:
         mesh: the surface.
-        rng: every random choice comes from it.
-        triangles: about how many there shall be.
-        split: False splits only as far as it must, which for fewer triangles than the mesh has is four times faster.
+        rng: source of all random choices.
+        triangles: approximate number of triangles of the result.
+        split: whether to split all triangles; False splits only as far as necessary, which is four times faster if the
+            result has fewer triangles than the mesh.
 
     Raises:
         MeshError: `mesh` has no faces, edges that more than two triangles share, or neighbours of opposite winding.
@@ -272,9 +274,9 @@ class Hair:
     """Hair as a 3dMD scanner sees it: a bumpy sheet over the scalp, tufts over the forehead, floating shreds.
 
     Args:
-        fringe_mm: how far down over the upper border of the surface the sheet comes.
-        thickness_mm: least and greatest distance of the sheet from the head.
-        sideburns_mm: how much lower the sheet comes at the temples.
+        fringe_mm: overlap of the sheet with the upper border of the surface.
+        thickness_mm: smallest and largest distance of the sheet from the head.
+        sideburns_mm: additional overlap of the sheet at the temples.
         tufts: number of locks that hang from the sheet.
         shreds: number of small patches that float free.
         spacing_mm: length of the edges of the sheet.
@@ -293,8 +295,8 @@ class Collar:
     """A collar: a bumpy band around the neck, below the surface and overlapping its lower border.
 
     Args:
-        height_mm: of the band.
-        overlap_mm: how far it comes up over the lower border of the surface.
+        height_mm: height of the band.
+        overlap_mm: overlap of the band with the lower border of the surface.
         spacing_mm: length of its edges.
     """
 

@@ -60,9 +60,9 @@ def write_skull_landmarks(folder: Path, *, count: int, seed: int = 0) -> Path:
     """Write skulls.tps, the table skulls.csv with species and site, and links.csv, the outline between landmarks.
 
     Args:
-        folder: created when missing.
+        folder: output folder; created if it does not exist.
         count: 8 to 10,000; species and sites alternate.
-        seed: a number of 0 or more.
+        seed: seed, 0 or more.
 
     Raises:
         InputError: a count out of range.

@@ -1,7 +1,7 @@
 """Trained classifiers and their file: one .skops archive without executable content, checked before it is loaded.
 
-skops writes the pipeline as a schema in JSON and arrays in .npy. Beside them stands `shapespace.json`: the format, the
-model's hash, the classes, how it was trained. Nothing in the file is run: types that are not in `TRUSTED` are refused.
+skops writes the pipeline as a schema in JSON and arrays in .npy. The archive also contains `shapespace.json`: the
+format, the model's hash, the classes and the training. Nothing in the file is run: types not in `TRUSTED` are rejected.
 """
 
 from __future__ import annotations
@@ -56,10 +56,10 @@ TRUSTED = frozenset(
         "numpy.int64",  # up to scikit-learn 1.7
     }
 )
-"""The types that a classifier's file may hold."""
+"""Types that the file of a classifier may contain."""
 _LOADERS = frozenset({"DictNode", "JsonNode", "ListNode", "NdArrayNode", "ObjectNode", "TupleNode", "TypeNode"})
 
-# C classes, K modes, P pairs of classes, O = C - 1; other letters are alike in all arrays of a classifier.
+# C classes, K modes, P pairs of classes, O = C - 1; any other letter is one size in all arrays of a classifier.
 _SHAPES: Mapping[str, Mapping[str, str]] = {
     "mean-direction": {"directions_": "CK"},
     "knn": {"_fit_X": "NK", "_y": "N"},
@@ -78,7 +78,7 @@ _SETTINGS: Mapping[str, Mapping[str, Any]] = {
     },
     "svm": {"kernel": "rbf", "_sparse": False},
 }  # fmt: skip
-"""Where scikit-learn's compiled code would trust what stands in the file."""
+"""Settings that must have these values, because scikit-learn's compiled code does not check them."""
 _OURS = sorted(name for name in TRUSTED if name.startswith("shapespace."))
 _LARGEST_BYTES = 2**28  # 256 MiB
 _LARGEST_JSON = 2**24  # 16 MiB
@@ -91,20 +91,20 @@ class SavedClassifier:
     """A trained classifier with its class names, calibration, model hash and training summary.
 
     Args:
-        pipeline: of scikit-learn, fitted.
-        classifier: its name in `CLASSIFIERS`.
+        pipeline: fitted pipeline of scikit-learn.
+        classifier: name of the classifier in `CLASSIFIERS`.
         model_hash: content hash of the model whose coefficients it takes.
-        modes: number of leading coefficients that it sees.
-        relative_to_neutral: whether it takes coefficients relative to the subject's neutral face.
+        modes: number of leading coefficients that it uses.
+        relative_to_neutral: whether its input is coefficients relative to the subject's neutral face.
         neutral: the label of neutral faces.
-        classes: C names, in the order of the probabilities.
+        classes: names of the C classes, in the order of the probabilities.
         confidence: probability below which the answer is "unsure".
-        temperature: that calibrates the pipeline's probabilities.
-        training: counts of what it was trained on and of what was left out.
-        cross_validation: how it did on people left out, or why that is not known.
-        versions: of the software that trained it.
-        projection: (Ke, K) from the model's coefficients to those of expression, which it then sees alone; None sees
-            the model's own.
+        temperature: temperature that calibrates the pipeline's probabilities.
+        training: counts of the training scans and of the excluded scans.
+        cross_validation: accuracy on held-out people, or the reason why it is not known.
+        versions: versions of the software that trained it.
+        projection: (Ke, K) matrix from the model's coefficients to those of expression, the only ones that it then
+            uses; None for the model's own coefficients.
 
     Example:
         >>> saved, notes = ss.train_classifier(scans, classifier="knn")
@@ -130,16 +130,16 @@ class SavedClassifier:
 
     @property
     def width(self) -> int:
-        """Number of the model's coefficients that it asks for."""
+        """Number of the model's coefficients that its input needs."""
         return self.modes if self.projection is None else self.projection.shape[1]
 
     def probabilities(self, z: FloatArray) -> FloatArray:
         """Return calibrated probabilities (n, C) for finite coefficients `z` (n, K or more), in standard deviations.
 
-        They must be relative to neutral if `relative_to_neutral` says so.
+        They must be relative to neutral if `relative_to_neutral` is true.
 
         Raises:
-            InputError: fewer coefficients than the classifier sees, or values that are not finite.
+            InputError: fewer coefficients than the classifier uses, or values that are not finite.
         """
         is_valid_shape = z.ndim == 2 and (
             z.shape[1] >= self.width if self.projection is None else z.shape[1] == self.width
@@ -154,10 +154,10 @@ class SavedClassifier:
         return calibrated(np.asarray(pipeline.predict_proba(z[:, : self.modes])), self.temperature)
 
     def refuse_other_model(self, model_hash: str) -> None:
-        """Raise unless `model_hash` is that of the model it was trained with.
+        """Raise an error unless `model_hash` is that of the model it was trained with.
 
         Raises:
-            InputError: it is another one.
+            InputError: it is the hash of another model.
         """
         if model_hash != self.model_hash:
             raise InputError(
@@ -196,7 +196,7 @@ class SavedClassifier:
         if path.suffix.lower() != ".skops":
             raise InputError(f"{path}: give the classifier's file a name that ends in .skops.")
         buffer = io.BytesIO(skops_io.dumps(self.pipeline))
-        # What the pipeline answers here tells another version, or a damaged file, that it answers something else.
+        # Probabilities of fixed input show whether another version, or a damaged file, gives other answers.
         facts = {**self.facts(), "probe": self.probabilities(_probe(self.width)).tolist()}
         with zipfile.ZipFile(buffer, "a") as archive:
             if self.projection is not None:
@@ -213,26 +213,27 @@ def software_versions() -> dict[str, str]:
 
 
 def load_classifier(path: Path | str) -> SavedClassifier:
-    """Read a classifier that `SavedClassifier.save` wrote, without running anything that the file holds.
+    """Read a classifier that `SavedClassifier.save` wrote, without running any content of the file.
 
     Raises:
-        FileError: it cannot be read.
-        FileFormatError: it is damaged, of another version, not a classifier, or holds types that are not trusted.
+        FileError: the file cannot be read.
+        FileFormatError: the file is damaged, of another version, not a classifier, or contains types that are not
+            trusted.
     """
     path = Path(path)
     check_file(path, _LARGEST_BYTES, _AGAIN)
     content = read_bytes(path)
     members = _members(path, content)
-    facts = _facts(path, members)
-    _check_types(path, _json(path, members, _SCHEMA))
+    facts = _read_facts(path, members)
+    _check_types(path, _read_json(path, members, _SCHEMA))
     try:
         with warnings.catch_warnings():
-            # Another version of scikit-learn is found out by the probe, which looks at the answers.
+            # The probe detects another version of scikit-learn by its probabilities.
             warnings.simplefilter("ignore")
             pipeline: Any = skops_io.loads(content, trusted=_OURS)
-    except Exception as error:  # a damaged schema may raise anything at all
-        raise FileFormatError(f"{path} holds a classifier that cannot be read; {_AGAIN}.") from error
-    saved = _saved(path, pipeline, facts, members.get(_PROJECTION))
+    except Exception as error:  # a damaged schema may raise any exception
+        raise FileFormatError(f"{path} contains a classifier that cannot be read; {_AGAIN}.") from error
+    saved = _parse_classifier(path, pipeline, facts, members.get(_PROJECTION))
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
@@ -243,8 +244,8 @@ def load_classifier(path: Path | str) -> SavedClassifier:
                 np.abs(probabilities - expected).max() <= _PROBE_TOLERANCE
             )
             same = same and tuple(str(name) for name in pipeline.classes_) == saved.classes
-    except Exception as error:  # whatever stands in its arrays
-        raise FileFormatError(f"{path} holds a classifier that does not work; {_AGAIN}.") from error
+    except Exception as error:  # its arrays may have any content
+        raise FileFormatError(f"{path} contains a classifier that does not work; {_AGAIN}.") from error
     if not same:
         saved_version, installed_version = saved.versions.get("scikit-learn", "unknown"), version("scikit-learn")
         cause = (
@@ -252,7 +253,7 @@ def load_classifier(path: Path | str) -> SavedClassifier:
             if saved_version != installed_version
             else "(the file is damaged)"
         )
-        raise FileFormatError(f"{path} answers otherwise than when it was trained {cause}; {_AGAIN}.")
+        raise FileFormatError(f"{path} gives other answers than when it was trained {cause}; {_AGAIN}.")
     return saved
 
 
@@ -277,7 +278,7 @@ def _members(path: Path, content: bytes) -> dict[str, bytes]:
     return members
 
 
-def _json(path: Path, members: Mapping[str, bytes], name: str) -> Any:
+def _read_json(path: Path, members: Mapping[str, bytes], name: str) -> Any:
     if name not in members or len(members[name]) > _LARGEST_JSON:
         raise FileFormatError(f"{path} is not a classifier of shapespace: it has no usable {name}; {_AGAIN}.")
     try:
@@ -287,7 +288,7 @@ def _json(path: Path, members: Mapping[str, bytes], name: str) -> Any:
 
 
 def _check_types(path: Path, schema: Any) -> None:
-    """Refuse a schema that names any type not trusted, wherever it stands."""
+    """Check that all types that a schema names, at any depth, are trusted."""
     open_nodes: list[Any] = [schema]
     while open_nodes:
         node = open_nodes.pop()
@@ -299,19 +300,19 @@ def _check_types(path: Path, schema: Any) -> None:
                 name = f"{known.get('__module__')}.{known.get('__class__')}"
                 if name not in TRUSTED:
                     raise FileFormatError(
-                        f"{path} holds the type {name[:80]!r}, which a classifier of shapespace does not need; do not "
-                        f"trust this file, and {_AGAIN}."
+                        f"{path} contains the type {name[:80]!r}, which a classifier of shapespace does not need; do "
+                        f"not trust this file, and {_AGAIN}."
                     )
             if str(known.get("__loader__", "DictNode")) not in _LOADERS:
                 raise FileFormatError(
-                    f"{path} holds a {str(known['__loader__'])[:40]!r}, which a classifier of shapespace does not "
+                    f"{path} contains a {str(known['__loader__'])[:40]!r}, which a classifier of shapespace does not "
                     f"need; do not trust this file, and {_AGAIN}."
                 )
             open_nodes += known.values()
 
 
-def _facts(path: Path, members: Mapping[str, bytes]) -> dict[str, Any]:
-    facts: Any = _json(path, members, FACTS)
+def _read_facts(path: Path, members: Mapping[str, bytes]) -> dict[str, Any]:
+    facts: Any = _read_json(path, members, FACTS)
     if not isinstance(facts, dict) or cast(dict[str, Any], facts).get("format") != FORMAT:
         raise FileFormatError(f"{path} is not a classifier of shapespace; {_AGAIN}.")
     known = cast(dict[str, Any], facts)
@@ -324,25 +325,25 @@ def _facts(path: Path, members: Mapping[str, bytes]) -> dict[str, Any]:
     return known
 
 
-def _saved(path: Path, pipeline: Any, facts: Mapping[str, Any], projection: bytes | None) -> SavedClassifier:
+def _parse_classifier(path: Path, pipeline: Any, facts: Mapping[str, Any], projection: bytes | None) -> SavedClassifier:
     try:
         if not isinstance(pipeline, Pipeline) or (facts["coefficients"] == "expression") != (projection is not None):
             raise TypeError
-        classes = tuple(_text(name) for name in cast(Sequence[Any], facts["classes"]))
+        classes = tuple(_require_text(name) for name in cast(Sequence[Any], facts["classes"]))
         saved = SavedClassifier(
             pipeline=pipeline,
-            classifier=_text(facts["classifier"]),
-            model_hash=_text(facts["model_hash"]),
+            classifier=_require_text(facts["classifier"]),
+            model_hash=_require_text(facts["model_hash"]),
             modes=int(facts["modes"]),
             relative_to_neutral=facts["relative_to_neutral"] is True,
-            neutral=_text(facts["neutral"]),
+            neutral=_require_text(facts["neutral"]),
             classes=classes,
             confidence=float(facts["confidence"]),
             temperature=float(facts["temperature"]),
             training=dict(facts["training"]),
             cross_validation=dict(facts["cross_validation"]),
             versions={str(name): str(number) for name, number in dict(facts["versions"]).items()},
-            projection=None if projection is None else _projection(projection),
+            projection=None if projection is None else _read_projection(projection),
         )
         is_valid = (
             saved.classifier in CLASSIFIERS
@@ -361,7 +362,7 @@ def _saved(path: Path, pipeline: Any, facts: Mapping[str, Any], projection: byte
 
 
 def _check_arrays(saved: SavedClassifier) -> None:
-    """Raise ValueError where arrays do not fit together: compiled code would read, and broadcasts grow, beyond them."""
+    """Raise ValueError if arrays do not fit together: compiled code would read, and broadcasts grow, beyond them."""
     pipeline: Any = saved.pipeline
     expected: Any = CLASSIFIERS[saved.classifier](0)
     if [type(step) for _, step in pipeline.steps] != [type(step) for _, step in expected.steps]:
@@ -376,19 +377,19 @@ def _check_arrays(saved: SavedClassifier) -> None:
     if any(getattr(fitted, name) != value for name, value in _SETTINGS.get(saved.classifier, {}).items()):
         raise ValueError
     if isinstance(fitted, SVC):
-        counts = np.asarray(getattr(fitted, "_n_support"))  # noqa: B009  # of no public name, and what libsvm walks by
+        counts = np.asarray(getattr(fitted, "_n_support"))  # noqa: B009  # no public name; libsvm iterates by it
         if counts.min() < 0 or counts.sum() != sizes["S"]:
             raise ValueError
 
 
-def _projection(content: bytes) -> FloatArray:
+def _read_projection(content: bytes) -> FloatArray:
     array = npy_array(content)
     if array.dtype != np.float64 or array.ndim != 2 or not np.isfinite(array).all():
         raise ValueError
     return cast(FloatArray, array)
 
 
-def _text(value: Any) -> str:
+def _require_text(value: Any) -> str:
     if not isinstance(value, str):
         raise TypeError
     return value

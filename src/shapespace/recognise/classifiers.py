@@ -27,7 +27,7 @@ from shapespace.recognise.learn import (
 from shapespace.types import FloatArray
 
 LDA_SHRINKAGE = 0.1
-"""Share of the round covariance in that of the LDA, unless cross-validation chooses another."""
+"""Default share of the isotropic covariance in the covariance of the LDA."""
 
 
 class NearestMeanDirection(ClassifierMixin, BaseEstimator):
@@ -38,7 +38,7 @@ class NearestMeanDirection(ClassifierMixin, BaseEstimator):
     out of its own mean, are most likely. A sample at the origin has no direction and equal probabilities.
 
     Args:
-        temperature: of the softmax; None finds it in `fit`.
+        temperature: temperature of the softmax; None estimates it in `fit`.
 
     Attributes:
         classes_: (C,) the classes, sorted.
@@ -170,11 +170,11 @@ def linear_rule(X: FloatArray, member: FloatArray, gram: FloatArray, shrinkage: 
 class ShrinkageQDA(_Discriminants):
     """Quadratic discriminant analysis with each class's covariance shrunk towards the pooled one (Friedman, JASA 1989).
 
-    It is (1 - a) S_class + a S, where S is the pooled covariance as `ShrinkageLDA` shrinks it, so that classes with
-    fewer samples than modes can be had. scikit-learn's refuses those.
+    It is (1 - a) S_class + a S, where S is the pooled covariance as `ShrinkageLDA` shrinks it, so that classes may have
+    fewer samples than modes. scikit-learn's QDA does not accept those.
 
     Args:
-        shrinkage: a, from 0 to 1.
+        shrinkage: weight a of the pooled covariance, from 0 to 1.
 
     Attributes:
         classes_: (C,) the classes, sorted.
@@ -222,18 +222,18 @@ class CalibratedSVC(ClassifierMixin, BaseEstimator):
     """A support vector machine with a Gaussian kernel whose probabilities come from its calibrated decision function.
 
     Probabilities are a softmax of the decision values over a temperature, at which the training samples are most likely
-    under machines that did not see them (three stratified folds). `SVC(probability=True)` is deprecated in
+    under machines that were not trained on them (three stratified folds). `SVC(probability=True)` is deprecated in
     scikit-learn, and its probabilities may disagree with its predictions; these do not.
 
     Args:
-        C: how much a sample on the wrong side costs.
-        temperature: of the softmax; None finds it in `fit`, which takes three more machines.
-        random_state: of the folds.
+        C: penalty of a sample on the wrong side.
+        temperature: temperature of the softmax; None estimates it in `fit`, which trains three more machines.
+        random_state: seed of the folds.
 
     Attributes:
         classes_: (C,) the classes, sorted.
         machine_: the fitted `SVC`.
-        temperature_: the temperature in use; 1 where a class has one sample only.
+        temperature_: the temperature in use; 1 if a class has one sample only.
     """
 
     def __init__(self, C: float = 3.0, temperature: float | None = None, random_state: int | None = None) -> None:
@@ -305,10 +305,10 @@ def likeliest_temperature(
     """Return the temperature that maximises the likelihood of the true classes under a softmax of `scores` (n, C).
 
     Args:
-        scores: of samples left out, logits up to the temperature.
+        scores: scores of held-out samples, logits up to the temperature.
         class_index: (n,) index of each sample's class.
-        doubt: share of each sample that counts for all classes alike.
-        bounds: coldest and hottest temperature; few samples alone would go anywhere.
+        doubt: share of each sample that counts equally for all classes.
+        bounds: smallest and largest temperature; few samples alone would not bound it.
     """
     C = scores.shape[1]
     target = (1 - doubt) * np.eye(C)[class_index] + doubt / C

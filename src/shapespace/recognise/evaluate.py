@@ -26,6 +26,7 @@ from shapespace.recognise.predictions import (
     Predictions,
     calibrated,
     calibration,
+    check_classifiers,
     classes_of,
     confusion,
     cross_validated_probabilities,
@@ -37,7 +38,6 @@ from shapespace.recognise.predictions import (
     nested_predictions,
     per_class,
     predict_probabilities,
-    refuse_unknown,
     subject_bootstrap,
     subject_folds,
     usable_training_rows,
@@ -50,9 +50,9 @@ class PermutationTest:
     """Macro accuracy, and its null distribution under permuted labels.
 
     Args:
-        observed: with the labels as they are.
-        null: (P,) with labels shuffled within each subject.
-        p: how often shuffled labels did at least as well, counting the observed ones.
+        observed: macro accuracy with the observed labels.
+        null: (P,) macro accuracies with labels shuffled within each subject.
+        p: share of permutations with at least this accuracy, counting the observed labels.
     """
 
     observed: float
@@ -81,23 +81,23 @@ class LearningCurve:
 def permutation_test(
     folds: Sequence[Fold], classifier: str = "lda", *, permutations: int = 200, seed: int = 0
 ) -> PermutationTest:
-    """Test whether labels mean anything, by shuffling them within each person.
+    """Test whether labels are related to the coefficients, by shuffling them within each person.
 
-    A person's labels are shuffled alike in every fold, so that the whole experiment is run again with wrong labels. The
-    rows of a person must therefore come in the same order in every fold. LDA is solved in closed form, which takes
-    milliseconds; other classifiers take their time.
+    A person's labels are shuffled in the same way in every fold, so that the complete experiment is repeated with wrong
+    labels. The rows of a person must therefore come in the same order in every fold. LDA is solved in closed form,
+    which takes milliseconds; other classifiers take longer.
 
     Args:
-        folds: the outer folds.
-        classifier: a name of `CLASSIFIERS`, with its own settings.
-        permutations: how many.
-        seed: of the permutations.
+        folds: outer folds.
+        classifier: a name of `CLASSIFIERS`, with its default settings.
+        permutations: number of permutations.
+        seed: seed of the permutations.
 
     Raises:
         InputError: no folds, an unknown classifier, or people whose number of rows differs between folds.
     """
     classes = classes_of(folds)
-    refuse_unknown([classifier])
+    check_classifiers([classifier])
     counts: dict[str, int] = {}
     for fold in folds:
         for part in (fold.train_subjects, fold.test_subjects):
@@ -222,20 +222,20 @@ def learning_curve(
 ) -> LearningCurve:
     """Return the macro accuracy on all test samples against the number of training people, drawn at random.
 
-    The coefficients stay those of the fold's own model; only the classifier sees fewer people.
+    The coefficients stay those of the fold's own model; only the classifier uses fewer people.
 
     Args:
-        folds: the outer folds.
-        classifier: a name of `CLASSIFIERS`, with its own settings.
-        subject_counts: people to train on; those that a fold does not have are left out of the curve.
-        repeats: draws of people.
-        seed: of the draws.
+        folds: outer folds.
+        classifier: a name of `CLASSIFIERS`, with its default settings.
+        subject_counts: numbers of training people; numbers that a fold does not have are omitted from the curve.
+        repeats: number of random draws of people.
+        seed: seed of the draws.
 
     Raises:
         InputError: no folds, an unknown classifier, or no fold with so many people.
     """
     classes = classes_of(folds)
-    refuse_unknown([classifier])
+    check_classifiers([classifier])
     fewest = min(len(set(fold.train_subjects)) for fold in folds)
     counts = [n for n in subject_counts if 1 <= n <= fewest]
     if not counts or repeats < 1:
@@ -269,14 +269,15 @@ def mode_importance(
 ) -> FloatArray:
     """Return the loss of macro accuracy, (F, K), when one mode is permuted among the test samples of a fold.
 
-    Modes of folds with shape models of their own agree only about; read the mean over the folds with that in mind.
+    Modes of folds with shape models of their own correspond only approximately; consider this in the mean over the
+    folds.
 
     Args:
-        folds: the outer folds.
-        classifier: a name of `CLASSIFIERS`, with its own settings.
-        modes: number of leading modes that it sees; None is all. The others have importance 0.
-        repeats: shuffles of each mode, whose losses are averaged.
-        seed: of the shuffles.
+        folds: outer folds.
+        classifier: a name of `CLASSIFIERS`, with its default settings.
+        modes: number of leading modes that it uses; None is all. The others have importance 0.
+        repeats: number of shuffles of each mode, whose losses are averaged.
+        seed: seed of the shuffles.
 
     Raises:
         InputError: no folds, or an unknown classifier.
@@ -284,7 +285,7 @@ def mode_importance(
     from sklearn.inspection import permutation_importance  # pyright: ignore[reportUnknownVariableType]
 
     classes = classes_of(folds)
-    refuse_unknown([classifier])
+    check_classifiers([classifier])
 
     def score(pipeline: Any, test: FloatArray, truth: Any) -> float:
         return macro_accuracy(truth, pipeline.predict(test), classes)
@@ -341,7 +342,8 @@ def decision_map(
     """Return the Fisher ratio of the classes at each vertex, (V,), as a map on the face.
 
     The ratio is the variance of the class means of a vertex's displacement over its variance within classes, both
-    summed over the three coordinates. `noise_mm` stands below, so that vertices which hardly move do not stand out.
+    summed over the three coordinates. The denominator includes `noise_mm`, so that nearly fixed vertices get low
+    ratios.
 
     Args:
         vertex_basis: (V, 3, K) displacement of each vertex with one mm of each coefficient.

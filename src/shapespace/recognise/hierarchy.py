@@ -26,10 +26,10 @@ class FaceTypes:
     """A mixture of T normal distributions of the leading identity coefficients.
 
     Args:
-        share: (T,) of the people.
-        mean: (T, D).
-        variance: (T, D).
-        bic: by number of types, from 1; the least is best.
+        share: (T,) shares of the people.
+        mean: (T, D) means.
+        variance: (T, D) variances.
+        bic: BIC by number of types, from 1; the smallest is best.
     """
 
     share: FloatArray
@@ -41,14 +41,14 @@ class FaceTypes:
     def fit(
         cls, a: FloatArray, *, types: int | None = None, max_types: int = 6, leading: int = 10, seed: int = 0
     ) -> FaceTypes:
-        """Fit to identity coefficients, one row a person.
+        """Fit to identity coefficients, one row per person.
 
         Args:
-            a: (S, Ka) in standard deviations.
-            types: how many; None for the number with the least BIC.
-            max_types: numbers tried then.
-            leading: coefficients that count.
-            seed: of the mixture's starts.
+            a: (S, Ka) identity coefficients in standard deviations.
+            types: number of types; None for the number with the smallest BIC.
+            max_types: largest number of types to try if `types` is None.
+            leading: number of leading coefficients that are used.
+            seed: seed of the starts of the mixture.
 
         Raises:
             InputError: fewer people than types.
@@ -90,8 +90,8 @@ class ExpressionByType:
     """An expression model and a linear classifier for each type of face.
 
     Args:
-        types: of face, from identity coefficients.
-        soft: weighs the answers by how likely each type is; else the likeliest type answers alone.
+        types: types of faces, by identity coefficients.
+        soft: whether to weight the answers by the probability of each type; otherwise only the likeliest type answers.
     """
 
     def __init__(self, types: FaceTypes, *, soft: bool) -> None:

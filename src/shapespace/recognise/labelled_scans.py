@@ -21,7 +21,7 @@ from shapespace.store.results import Results, modes_of
 from shapespace.types import BoolArray, FloatArray, read_only
 
 NEUTRAL = "neutral"
-"""The label of neutral faces, unless another is given."""
+"""Default label of neutral faces."""
 
 STATUSES = ("converged", "max_iterations", "doubtful", "failed")
 _LARGEST_BYTES = 2**28  # 256 MiB
@@ -33,14 +33,14 @@ class ScanCoefficients:
     """Coefficients, labels and status of one fitted scan.
 
     Args:
-        name: of the fit.
-        status: `converged`, `max_iterations`, `doubtful` or `failed`.
-        reason: why it has that status.
-        z: (K,) coefficients in standard deviations; None where the fit failed.
+        name: name of the fit.
+        status: status of the fit: `converged`, `max_iterations`, `doubtful` or `failed`.
+        reason: reason for the status.
+        z: (K,) coefficients in standard deviations; None if the fit failed.
         model_hash: content hash of the model.
-        label: its class; empty if not known.
-        subject: whom it shows; empty if not known.
-        file: name of the scan's file, where it is known.
+        label: class of the scan; empty if not known.
+        subject: subject of the scan; empty if not known.
+        file: name of the scan's file; empty if not known.
     """
 
     name: str
@@ -64,7 +64,7 @@ def from_record(name: str, record: FitRecord) -> ScanCoefficients:
     """Return the scan of a NAME.fit.json.
 
     Raises:
-        FileFormatError: the record lacks what recognition needs, or it is damaged.
+        FileFormatError: the record lacks data that recognition needs, or it is damaged.
     """
     if record.status != "failed" and not record.z:
         raise FileFormatError(f"The record of {name} is incomplete or contradicts itself; fit the scan again.")
@@ -76,7 +76,7 @@ def from_record(name: str, record: FitRecord) -> ScanCoefficients:
 def from_results(results: Results) -> list[ScanCoefficients]:
     """Return the fits of a folder with a store, in the order of their names.
 
-    Fits in unreadable shards are left out; `Results.problems` lists them.
+    Fits in unreadable shards are excluded; `Results.problems` lists them.
 
     Raises:
         FileFormatError: a fit is damaged, or lacks data that recognition needs.
@@ -96,7 +96,7 @@ def from_results(results: Results) -> list[ScanCoefficients]:
                 _check(ScanCoefficients(name, status, reason, coefficients, model, file=file), f"The fit {name}")
             )
     if not scans:
-        raise InputError(f"{results.folder} holds no results of fits; fit some scans first.")
+        raise InputError(f"{results.folder} contains no results of fits; fit some scans first.")
     return sorted(scans, key=lambda scan: scan.name)
 
 
@@ -104,8 +104,8 @@ def read_coefficients(path: Path) -> list[ScanCoefficients]:
     """Return the scans in a coefficients.csv.
 
     Raises:
-        FileError: it cannot be read.
-        FileFormatError: it is not such a table, or it does not say of which model it is.
+        FileError: the file cannot be read.
+        FileFormatError: the file is not such a table, or it does not state the model of its coefficients.
     """
     check_file(path, _LARGEST_BYTES, _TABLE_AGAIN)
     rows = table_rows(read_bytes(path))
@@ -133,7 +133,7 @@ def _modes(heads: Sequence[str], path: Path) -> int:
         raise FileFormatError(f"{path} is no table of coefficients; give one that shapespace fit wrote.")
     if "model_hash" not in known:
         raise FileFormatError(
-            f"{path} does not say of which model its coefficients are; run shapespace fit to write it again, "
+            f"{path} does not state the model of its coefficients; run shapespace fit to write it again, "
             "or give the folder of the results."
         )
     return modes
@@ -157,7 +157,7 @@ def _check(scan: ScanCoefficients, row_name: str) -> ScanCoefficients:
     if scan.z is not None and (scan.z.ndim != 1 or not len(scan.z) or not np.isfinite(scan.z).all()):
         raise FileFormatError(f"{row_name} has coefficients that are not finite numbers; fit the scan again.")
     if not scan.model_hash:
-        raise FileFormatError(f"{row_name} does not say of which model its coefficients are; fit the scan again.")
+        raise FileFormatError(f"{row_name} does not state the model of its coefficients; fit the scan again.")
     return scan
 
 

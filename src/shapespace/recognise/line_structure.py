@@ -25,11 +25,11 @@ class LineScores:
 
     Args:
         r2_through_neutral: share of the summed squares that the best line through neutral explains.
-        r2_free: share of the scatter about the samples' mean that the best line anywhere explains. Its whole is smaller
-            than that of `r2_through_neutral`, so it may be the lower of the two.
+        r2_free: share of the scatter about the samples' mean that the best line anywhere explains. This scatter is
+            smaller than the sum of squares of `r2_through_neutral`, so the share may be the lower one.
         sign_consistency: share of samples on the positive side of neutral.
         spearman: rank correlation of position along the line with intensity.
-        permutation_p: how often shuffled intensities correlate at least as well.
+        permutation_p: share of shuffled intensities that correlate at least as well.
     """
 
     r2_through_neutral: float
@@ -44,13 +44,13 @@ class PooledLineScores:
     """Scores of the lines of all expressions together.
 
     Args:
-        r2_through_neutral: by expression, as in `LineScores`.
-        r2_p: by expression, how often as many samples with shuffled labels lie on a line at least as well.
-        mean_r2_p: the same of the mean over the expressions.
+        r2_through_neutral: expression -> share of the squares on its line, as in `LineScores`.
+        r2_p: expression -> share of shuffles of the labels in which as many samples lie on a line at least as well.
+        mean_r2_p: the same share for the mean over the expressions.
         spearman: mean over the expressions of the rank correlation with intensity; None without intensities.
-        monotonicity_p: how often intensities shuffled within each expression correlate at least as well on average.
-            Four levels of one expression alone cannot go below 1/24; those of several together can. None without
-            intensities.
+        monotonicity_p: share of shuffles of the intensities within each expression that correlate at least as well on
+            average. Four levels of a single expression cannot have less than 1/24; those of several expressions can.
+            None without intensities.
     """
 
     r2_through_neutral: Mapping[str, float]
@@ -65,16 +65,16 @@ class DisjointnessScores:
     """Scores of the separation of the expressions.
 
     Args:
-        leave_one_out_accuracy: of the nearest mean direction by cosine.
+        leave_one_out_accuracy: accuracy of the nearest mean direction by cosine.
         chance: accuracy of guessing the commonest expression.
         cosine_silhouette: mean silhouette by cosine distance, -1 to 1.
         separability: trace of the pooled within-class scatter's pseudo-inverse times the between-class scatter.
-        accuracy_p: permutation p of the accuracy,
-        silhouette_p: of the silhouette,
-        separability_p: of the separability,
-        margin_p: and of the smallest margin, over shuffled labels.
-        smallest_margin: over all pairs of expressions, the gap between their nearest samples along the pair's linear
-            discriminant, in pooled within-class standard deviations there; negative where the samples overlap.
+        accuracy_p: p of the accuracy over shuffled labels.
+        silhouette_p: p of the silhouette over shuffled labels.
+        separability_p: p of the separability over shuffled labels.
+        margin_p: p of the smallest margin over shuffled labels.
+        smallest_margin: smallest gap, over all pairs of expressions, between their nearest samples along the pair's
+            linear discriminant, in pooled within-class standard deviations; negative if the samples overlap.
         smallest_margin_pair: the two expressions with that margin.
     """
 
@@ -95,9 +95,9 @@ def line_scores(v: FloatArray, intensity: FloatArray, *, permutations: int = 999
 
     Args:
         v: (n, K) coefficients relative to neutral in standard deviations.
-        intensity: (n,).
-        permutations: of the intensities.
-        seed: of the permutations.
+        intensity: (n,) intensity of each sample.
+        permutations: number of permutations of the intensities.
+        seed: seed of the permutations.
 
     Raises:
         InputError: fewer than three samples, or all of them neutral.
@@ -134,10 +134,10 @@ def pooled_line_scores(
 
     Args:
         v: (n, K) coefficients relative to neutral in standard deviations.
-        labels: n expression names, at least two of them with at least two samples each.
-        intensity: (n,), or None where it is not known.
-        permutations: of the labels, and of the intensities.
-        seed: of the permutations.
+        labels: n expression names, at least two names with at least two samples each.
+        intensity: (n,) intensity of each sample; None if not known.
+        permutations: number of permutations of the labels, and of the intensities.
+        seed: seed of the permutations.
 
     Raises:
         InputError: one expression only, one with a single sample, or an expression of neutral samples alone.
@@ -189,9 +189,9 @@ def disjointness(v: FloatArray, labels: Sequence[str], *, permutations: int = 99
 
     Args:
         v: (n, K) coefficients relative to neutral in standard deviations.
-        labels: n expression names, at least two of each.
-        permutations: of the labels.
-        seed: of the permutations.
+        labels: n expression names, at least two samples of each.
+        permutations: number of permutations of the labels.
+        seed: seed of the permutations.
 
     Raises:
         InputError: one expression only, or one with a single sample.
@@ -203,7 +203,7 @@ def disjointness(v: FloatArray, labels: Sequence[str], *, permutations: int = 99
         raise InputError("Disjointness needs at least two expressions with at least two samples each.")
     length = np.linalg.norm(v, axis=1, keepdims=True)
     unit = np.divide(v, length, out=np.zeros_like(v), where=length > 0)
-    # All samples lie in the span of their n rows, where these two scores are the same and cheaper.
+    # All samples lie in the span of their n rows, in which these two scores are the same and cheaper.
     inside = v @ np.linalg.svd(v, full_matrices=False)[2].T
     accuracy, silhouette = _accuracy(unit, classes), _silhouette(unit, classes)
     separability, (margin, pair) = _separability(inside, classes), _smallest_margin(inside, classes)
@@ -224,7 +224,7 @@ def disjointness(v: FloatArray, labels: Sequence[str], *, permutations: int = 99
 
 
 def _position(v: FloatArray) -> FloatArray:
-    """Return (n,) positions along the best line through neutral; its sense is that of the mean sample."""
+    """Return (n,) positions along the best line through neutral; the mean sample is on its positive side."""
     u = np.linalg.svd(v, full_matrices=False)[2][0]
     along = v @ u
     return -along if along.sum() < 0 else along
@@ -282,7 +282,7 @@ def _smallest_margin(v: FloatArray, classes: np.ndarray) -> tuple[float, tuple[i
     means = np.stack([v[classes == c].mean(axis=0) for c in range(n_classes)])
     deviation = v - means[classes]
     within = deviation.T @ deviation / max(len(v) - n_classes, 1)
-    # A floor for samples without scatter, and a little of a round one, since there may be fewer samples than modes.
+    # A floor for samples without scatter, and some isotropic variance, since there may be fewer samples than modes.
     within += (1e-12 * float((v**2).mean()) + 1e-300) * np.eye(len(within))
     shrunk = (1 - _SHRINKAGE) * within + _SHRINKAGE * np.trace(within) / len(within) * np.eye(len(within))
     best = (np.inf, (0, 1))
@@ -311,4 +311,4 @@ def _check(v: FloatArray, other: FloatArray) -> None:
     if v.ndim != 2 or len(v) != len(other) or len(v) < 3:
         raise InputError(f"Scores need (n, K) coefficients and n values with n at least 3, not {v.shape}.")
     if not (np.isfinite(v).all() and np.isfinite(other).all()):
-        raise InputError("Coefficients and intensities must be finite; leave failed fits out and say so.")
+        raise InputError("Coefficients and intensities must be finite; exclude failed fits and report them.")

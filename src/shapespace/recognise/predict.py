@@ -37,39 +37,40 @@ from shapespace.schemas import FIT_AGAIN, FitRecord, read
 from shapespace.types import FloatArray, IntArray, Mesh, require
 
 Surface: TypeAlias = MeshLike | FitResult | FitRecord | Mapping[str, Any]
-"""A mesh or what `as_mesh` takes, the result of a fit, or its record, typed or as the content of NAME.fit.json."""
+"""A mesh or input of `as_mesh`, the result of a fit, or its record, typed or as the content of NAME.fit.json."""
 Surfaces: TypeAlias = Sequence[Surface] | FloatArray | str | PathLike[str]
-"""Several of them; (n, V, 3) vertices; or the folder of meshes in correspondence."""
+"""Several surfaces; (n, V, 3) vertices; or the folder of meshes in correspondence."""
 _COUNT = re.compile(r"\d+ (of \d+ )?(vertex is|vertices are) (missing|taken)")  # sentences on missing vertices
 
 
 class ShapeSpace(TransformerMixin, BaseEstimator):
     """Transformer of meshes or fits to coefficients in standard deviations, z, for scikit-learn pipelines.
 
-    `fit` builds a `ShapeModel` from meshes in correspondence, or takes `model` as it is. `transform` takes a mix of:
+    `fit` builds a `ShapeModel` from meshes in correspondence, or uses `model` as it is. `transform` takes a mix of:
 
     - meshes in the model's vertex order, which are projected (`meshes="corresponding"`), or raw scans, which are fitted
-      by `fit_scan` (`meshes="scans"`); a mesh alone does not say which it is;
-    - `FitResult`s and records of fits (as read from NAME.fit.json), of the same model, whose z is taken.
+      by `fit_scan` (`meshes="scans"`); a mesh alone does not show which kind it is;
+    - `FitResult`s and records of fits (as read from NAME.fit.json), of the same model, whose z is used.
 
     A record of a failed fit, or a scan that cannot be fitted, becomes a row of NaN; it is not dropped, and a warning
-    says why. A doubtful fit keeps its coefficients here: see `status` of the fit.
+    states the reason. A doubtful fit keeps its coefficients here: see `status` of the fit.
 
     Args:
-        modes: as in `BuildConfig`: a number, a share of the variance, "auto" or "all". A warning states notes of the
-            model, such as that the meshes determine fewer modes.
-        n_components: the same by the name that scikit-learn has for it, None to use `modes`; give one of both.
-        gauge: `form` or `shape`.
-        align: False takes meshes as they stand, also in `transform`.
-        alignment_vertices: indices that carry the alignment of the training meshes.
-        model: a model, or its file, to use instead of building one; the settings above, but `align`, then mean nothing.
-        meshes: what meshes given to `transform` are: "corresponding" or "scans".
-        config: settings of the fits of scans; None for the usual ones.
-        seed: of the choice of modes.
+        modes: number of modes, as in `BuildConfig`: a number, a share of the variance, "auto" or "all". Notes of the
+            model, such as that the meshes determine fewer modes, become warnings.
+        n_components: number of modes by the name that scikit-learn uses; None for `modes`. Only one may be given.
+        gauge: size handling, `form` or `shape`.
+        align: whether to align the meshes, also in `transform`; False uses them unchanged.
+        alignment_vertices: indices of the vertices by which the training meshes are aligned.
+        model: model, or its file, to use instead of building one; the settings above, except `align`, then have no
+            effect.
+        meshes: kind of the meshes in `transform`: "corresponding" or "scans".
+        config: settings of the fits of scans; None for the defaults.
+        seed: seed of the choice of modes.
 
     Attributes:
         model_: the `ShapeModel`.
-        model_hash_: its content hash.
+        model_hash_: content hash of the model.
         n_features_out_: K, the number of modes.
     """
 
@@ -101,16 +102,16 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
         return ShapeSpace(**cast(dict[str, Any], self.get_params(deep=False)))
 
     def fit(self, X: Surfaces, y: Any = None) -> ShapeSpace:
-        """Build the shape space of meshes in correspondence, mm, or take the ready `model`, whatever `X` is.
+        """Build the shape space of meshes in correspondence, mm, or use the given `model` and ignore `X`.
 
         Raises:
             CorrespondenceError: the meshes differ in vertices or triangles.
-            InputError: something else than meshes, too few of them, no variation, unknown settings.
+            InputError: something else than meshes, too few meshes, no variation, unknown settings.
         """
         if self.n_components is not None and self.modes not in (None, "all", self.n_components):
             raise InputError(
                 f"modes is {self.modes!r} and n_components {self.n_components!r}, but both are the number of modes; "
-                "give one of them."
+                "give only one."
             )
         if self.meshes not in ("corresponding", "scans"):
             raise InputError(f"There is no kind of meshes {self.meshes!r}; choose corresponding or scans.")
@@ -147,7 +148,7 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
         """Return coefficients z (n, K) in standard deviations of the model; rows of failed fits are NaN.
 
         Raises:
-            CorrespondenceError: a mesh that is not in the model's vertex order, where meshes are not scans.
+            CorrespondenceError: a mesh that is not in the model's vertex order, if meshes are not scans.
             InputError: a fit of another model, or something that is neither mesh nor fit.
             FileFormatError: a record that is damaged.
         """
@@ -158,12 +159,12 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
     def _coefficients(self, surface: Surface, number: int) -> FloatArray:
         model = self.model_
         if isinstance(surface, FitResult):
-            self._refuse_other_model(surface.model_hash, surface.scan_name)
-            return self._of_fit(surface)
+            self._check_model_hash(surface.model_hash, surface.scan_name)
+            return self._coefficients_of_fit(surface)
         name = f"number {number}"
         if not isinstance(surface, FitRecord | Mapping):
             if self.meshes == "scans":
-                return self._of_scan(surface, number)
+                return self._coefficients_of_scan(surface, number)
             return model.to_z(model.project(as_mesh(surface, name), align=self.align))
         record = (
             surface
@@ -171,24 +172,26 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
             else read(FitRecord, cast(Mapping[str, Any], surface), f"The record of {name}", FIT_AGAIN)
         )
         scan = from_record(name, record)
-        self._refuse_other_model(scan.model_hash, scan.file)
+        self._check_model_hash(scan.model_hash, scan.file)
         if scan.z is None:
             return np.full(model.n_modes, np.nan)
         if scan.z.shape != (model.n_modes,):
             raise InputError(f"The record of {scan.file} has {len(scan.z)} coefficients, not {model.n_modes}.")
         return scan.z
 
-    def _of_scan(self, scan: MeshLike, number: int) -> FloatArray:
+    def _coefficients_of_scan(self, scan: MeshLike, number: int) -> FloatArray:
         try:
-            return self._of_fit(fit_scan(self.model_, as_mesh(scan, f"number {number}"), self.config or FitConfig()))
+            return self._coefficients_of_fit(
+                fit_scan(self.model_, as_mesh(scan, f"number {number}"), self.config or FitConfig())
+            )
         except ShapespaceError as error:
             warnings.warn(f"Number {number} has no coefficients: {error}", stacklevel=4)
             return np.full(self.model_.n_modes, np.nan)
 
-    def _of_fit(self, result: FitResult) -> FloatArray:
+    def _coefficients_of_fit(self, result: FitResult) -> FloatArray:
         return np.full(self.model_.n_modes, np.nan) if result.status == "failed" else result.z
 
-    def _refuse_other_model(self, model_hash: str, name: str) -> None:
+    def _check_model_hash(self, model_hash: str, name: str) -> None:
         if model_hash != self.model_hash_:
             raise InputError(
                 f"{name} was fitted with the model {model_hash[:12]}, and this shape space is {self.model_hash_[:12]}; "
@@ -218,12 +221,12 @@ def _items(X: Surfaces) -> Sequence[Any]:
 
 
 UNSURE = "unsure"
-"""The answer where the likeliest class is less likely than the stated confidence, or the fit is doubtful."""
+"""Answer if the likeliest class is less likely than the stated confidence, or if the fit is doubtful."""
 
 CONFIDENCE = 0.5
-"""The confidence unless another is given: below it the likeliest class is more likely wrong than right."""
+"""Default confidence: below it the likeliest class is more likely wrong than right."""
 
-_FOLDS = 5  # folds by subject of the calibration
+_FOLDS = 5  # number of folds by subject for the calibration
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,11 +235,11 @@ class ScanPrediction:
 
     Args:
         scan: name of the fit.
-        status: of the fit.
-        prediction: a class, `UNSURE`, or empty where the fit failed or there is nothing to compare it with.
-        probabilities: (C,), or None where no probabilities can be given.
-        reason: why there is no class; empty where there is one.
-        neutral: whether it is a neutral face that others are compared with, which needs no answer.
+        status: status of the fit.
+        prediction: class, `UNSURE`, or empty if the fit failed or the reference face is missing.
+        probabilities: (C,) probabilities of the classes; None if they cannot be computed.
+        reason: reason why there is no class; empty if there is one.
+        neutral: whether it is a neutral face with which others are compared, and which needs no answer.
 
     Example:
         >>> from shapespace.recognise.predict import predict_scans
@@ -268,23 +271,23 @@ def train_classifier(
 ) -> tuple[SavedClassifier, list[str]]:
     """Train a classifier on fitted scans with labels; return it with notes for the user.
 
-    Failed and doubtful fits and scans without a label are left out and counted. Probabilities are calibrated on people
-    left out in turn (on scans left out where no people are named), which also gives the accuracy that is reported.
+    Failed and doubtful fits and scans without a label are excluded and counted. Probabilities are calibrated on
+    held-out people (on held-out scans if no people are named), which also gives the accuracy that is reported.
 
     Args:
-        scans: with labels, and for `relative` with subjects.
+        scans: scans with labels, and for `relative` with subjects.
         classifier: a name of `CLASSIFIERS`.
-        relative: take coefficients relative to the subject's neutral face; neutral faces are then no class.
-        neutral: the label of neutral faces.
+        relative: whether to use coefficients relative to the subject's neutral face; neutral faces are then no class.
+        neutral: label of neutral faces.
         confidence: probability, 0 to 1, below which the answer will be `UNSURE`.
-        modes: number of leading coefficients to see; None is all.
-        projection: (Ke, K) from coefficients to those of expression, to see these alone: the last rows of
+        modes: number of leading coefficients to use; None for all.
+        projection: (Ke, K) matrix from coefficients to those of expression, to use only these: the last rows of
             `AdditiveModel.rotation`.
-        seed: of folds and classifier.
+        seed: seed of folds and classifier.
 
     Raises:
         InputError: an unknown classifier, fits of different models, too few labels, people without a neutral face,
-            or more modes than there are.
+            or too many modes.
 
     Example:
         >>> saved, notes = ss.train_classifier(scans, modes=3)
@@ -303,7 +306,7 @@ def train_classifier(
             "read them with shapespace.recognise.labelled_scans.read_coefficients",
         )
     model_hash = one_model(scans)
-    used, left_out_counts, notes = _with_labels(scans)
+    used, left_out_counts, notes = _select_labelled(scans)
     z, labels, subjects = _samples(used, neutral if relative else None, projection)
     K = _modes(z.shape[1], modes)
     z = z[:, :K]
@@ -338,8 +341,8 @@ def train_classifier(
     return saved, notes
 
 
-def _with_labels(scans: Sequence[ScanCoefficients]) -> tuple[list[ScanCoefficients], dict[str, int], list[str]]:
-    """Return the scans to train on, how many are left out and why, and the same in sentences."""
+def _select_labelled(scans: Sequence[ScanCoefficients]) -> tuple[list[ScanCoefficients], dict[str, int], list[str]]:
+    """Return the training scans, the number of excluded scans by reason, and the same as sentences."""
     labelled = [scan for scan in scans if scan.label]
     used = [scan for scan in labelled if scan.trusted]
     untrusted = Counter(scan.status for scan in labelled if not scan.trusted)
@@ -349,9 +352,9 @@ def _with_labels(scans: Sequence[ScanCoefficients]) -> tuple[list[ScanCoefficien
             f"None of the {len(scans)} scans has both a label and a fit to be trusted; check that the table of labels "
             "names the scans."
         )
-    notes = [f"{count} {status} of the fits with a label left out." for status, count in sorted(untrusted.items())]
+    notes = [f"{count} {status} of the fits with a label excluded." for status, count in sorted(untrusted.items())]
     if without_label:
-        notes.append(f"{without_label} of {len(scans)} scans have no label and are left out.")
+        notes.append(f"{without_label} of {len(scans)} scans have no label and are excluded.")
     return used, {**dict(untrusted), "without_label": without_label}, notes
 
 
@@ -372,7 +375,7 @@ def _samples(
         return z, labels, subjects
     if not all(subjects):
         raise InputError(
-            "Coefficients relative to neutral need to know whom each scan shows; add a column subject to the labels."
+            "Coefficients relative to neutral need the subject of each scan; add a column subject to the labels."
         )
     expressive = labels != neutral
     z = relative_to_neutral(z, subjects, ~expressive)[expressive]
@@ -384,7 +387,7 @@ def _samples(
 
 
 def _classes(labels: Any) -> tuple[list[str], list[int]]:
-    """Return the classes and their sample counts; raise if they cannot be learned."""
+    """Return the classes and their sample counts; raise an error if they cannot be learned."""
     classes, counts = np.unique(labels, return_counts=True)
     if len(classes) < 2 or counts.min() < 2:
         counts_text = ", ".join(f"{name} ({n})" for name, n in zip(classes, counts, strict=True)) or "none"
@@ -392,19 +395,19 @@ def _classes(labels: Any) -> tuple[list[str], list[int]]:
             f"Training needs at least two classes with at least two scans each; these were found: {counts_text}."
         )
     if UNSURE in classes:
-        raise InputError(f"The label {UNSURE!r} is what shapespace answers below the confidence; give it another name.")
+        raise InputError(f"The label {UNSURE!r} is the answer below the confidence; give it another name.")
     return classes.tolist(), counts.tolist()
 
 
 def _calibrate(
     z: FloatArray, labels: Any, subjects: Sequence[str], classes: Sequence[str], classifier: str, seed: int
 ) -> tuple[float, dict[str, Any], str]:
-    """Return the temperature, the cross-validation result, and notes for the user."""
+    """Return the temperature, the cross-validation result, and a note for the user."""
     by_subject = all(subjects)
     groups = list(subjects) if by_subject else [str(i) for i in range(len(z))]
     folds = min(_FOLDS, len(set(groups)))
     splits = subject_folds(groups, folds, seed) if folds >= 2 else []
-    # A fold that would leave one class alone to train on teaches nothing.
+    # A fold with a single training class cannot be used.
     if not splits or any(len(np.unique(labels[train])) < 2 for train, _ in splits):
         note = "There are too few subjects for cross-validation: accuracy is unknown, probabilities are not calibrated."
         return 1.0, {"macro_accuracy": None, "by": None, "folds": 0}, note
@@ -423,17 +426,17 @@ def _calibrate(
 def predict_scans(saved: SavedClassifier, scans: Sequence[ScanCoefficients]) -> list[ScanPrediction]:
     """Return one prediction per scan, in the order of `scans`.
 
-    A failed fit gets no answer; a doubtful one, or one below the confidence, gets `UNSURE`; each with its reason.
+    A failed fit gets no prediction; a doubtful fit, or a fit below the confidence, gets `UNSURE`; each with its reason.
 
     Raises:
-        InputError: the fits are not of the classifier's model, or have fewer modes than it sees.
+        InputError: the fits are not of the classifier's model, or have fewer modes than it uses.
     """
     saved.refuse_other_model(one_model(scans))
     zero = _neutral_of(saved, scans) if saved.relative_to_neutral else {}
     answers: list[ScanPrediction] = []
     for scan in scans:
         is_reference = saved.relative_to_neutral and scan.label == saved.neutral
-        refusal = _refusal(saved, scan, zero, is_reference)
+        refusal = _reason_without_prediction(saved, scan, zero, is_reference)
         if refusal is not None or scan.z is None:
             doubtful = scan.status == "doubtful" and not is_reference
             answers.append(
@@ -462,10 +465,10 @@ def _neutral_of(saved: SavedClassifier, scans: Sequence[ScanCoefficients]) -> di
     return {name: np.mean(z, axis=0) for name, z in neutrals.items()}
 
 
-def _refusal(
+def _reason_without_prediction(
     saved: SavedClassifier, scan: ScanCoefficients, zero: dict[str, FloatArray], is_reference: bool
 ) -> str | None:
-    """Return why there can be no probabilities for `scan`, or None."""
+    """Return the reason why `scan` has no probabilities; None if it has."""
     if scan.z is None:
         return scan.reason
     if not scan.trusted:
@@ -474,7 +477,7 @@ def _refusal(
         return "The neutral face that its subject's other scans are compared with."
     if saved.relative_to_neutral and not scan.subject:
         return (
-            "The classifier compares with the subject's neutral face, and the labels do not say whom this scan shows."
+            "The classifier compares with the subject's neutral face, and the labels do not name this scan's subject."
         )
     if saved.relative_to_neutral and scan.subject not in zero:
         return f"There is no usable neutral face of {scan.subject} to compare this scan with."
@@ -516,5 +519,5 @@ def _modes(available: int, modes: int | None) -> int:
     if modes is None:
         return available
     if not 1 <= modes <= available:
-        raise InputError(f"There are {available} coefficients, so a classifier cannot see {modes} of them.")
+        raise InputError(f"There are {available} coefficients, so a classifier cannot use {modes}.")
     return modes

@@ -1,8 +1,8 @@
 """Cross-validated predictions: folds by subject, and nested selection of hyperparameters.
 
-Everything here works on arrays of whitened coefficients, (n, K). A `Fold` carries its own training and test arrays, so
-that the shape model behind them may be another one in each fold, made without the people tested. A test row that is not
-finite stands for a fit that failed: it gets no answer, and counts as wrong. Such training rows are left out.
+Everything here works on arrays of whitened coefficients, (n, K). A `Fold` contains its own training and test arrays, so
+that each fold may have its own shape model, built without the tested people. A test row that is not finite is a failed
+fit: it gets no answer, and counts as wrong. Such training rows are excluded.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from shapespace.reprs import short_repr
 from shapespace.types import FloatArray
 
 MODES: tuple[int | None, ...] = (10, 20, 40, None)
-"""Numbers of leading modes among which nested cross-validation chooses; None is all."""
+"""Numbers of leading modes from which nested cross-validation chooses; None is all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,14 +33,14 @@ class Fold:
     """One training and one test set, of different people.
 
     Args:
-        train: (n, K) coefficients in standard deviations.
+        train: (n, K) training coefficients in standard deviations.
         train_labels: n classes.
         train_subjects: n names of people.
-        test: (m, K), by the same model.
+        test: (m, K) test coefficients by the same model.
         test_labels: m classes.
-        test_subjects: m names of people, none of them trained on.
-        test_index: (m,) place of each test sample in the whole, which orders `Predictions`; None keeps the order of the
-            folds.
+        test_subjects: m names of people, none of whom is in the training set.
+        test_index: (m,) index of each test sample among all samples, by which `Predictions` are ordered; None keeps the
+            order of the folds.
 
     Raises:
         InputError: arrays that do not belong together, or a person in both sets.
@@ -81,10 +81,10 @@ class Choice:
 
     Args:
         classifier: a name of `CLASSIFIERS`.
-        parameters: of its pipeline.
+        parameters: parameters of its pipeline.
         modes: number of leading modes.
-        temperature: that calibrates its probabilities.
-        macro_accuracy: of the choice, within the training people.
+        temperature: temperature that calibrates its probabilities.
+        macro_accuracy: macro accuracy of the choice, within the training people.
     """
 
     classifier: str
@@ -101,11 +101,11 @@ class Predictions:
     Args:
         classes: C names, sorted.
         labels: n true classes.
-        predicted: n answers; empty where the fit failed.
-        probabilities: (n, C); NaN where the fit failed.
+        predicted: n answers; empty if the fit failed.
+        probabilities: (n, C) probabilities; NaN if the fit failed.
         subjects: n names of people.
         index: (n,) `test_index`, or 0 to n - 1.
-        chosen: one a fold.
+        chosen: choice of each fold.
     """
 
     classes: tuple[str, ...]
@@ -129,7 +129,7 @@ def subject_folds(subjects: Sequence[str], n_folds: int, seed: int = 0) -> list[
     count = len(np.unique(people))
     if not 2 <= n_folds <= count:
         raise InputError(f"{count} subjects cannot be split into {n_folds} folds; ask for 2 to {count}.")
-    # One class for all: then it evens out the number of samples, which GroupKFold does only unshuffled.
+    # With one class for all, the splitter balances the number of samples, which GroupKFold does only unshuffled.
     splitter: Any = StratifiedGroupKFold(n_folds, shuffle=True, random_state=seed)
     return list(splitter.split(people, np.zeros(len(people)), people))
 
@@ -139,8 +139,8 @@ def folds_of(
 ) -> list[Fold]:
     """Return folds of (n, K) coefficients that all come from one shape model.
 
-    That model may have seen the people tested, which flatters; for an honest figure make each fold's model without
-    them.
+    That model may have been trained on the tested people, which makes results too good; for an unbiased estimate build
+    each fold's model without them.
 
     Raises:
         InputError: arrays that do not belong together, or too few people.
@@ -165,30 +165,31 @@ def nested_predictions(
 ) -> Predictions:
     """Predict the test samples of each fold with hyperparameters selected in its training subjects alone.
 
-    Inside the training people, again split by person: first the number of leading modes is chosen by LDA, then the
-    classifier and its parameters with that many, each by macro accuracy of the samples left out. The probabilities of
-    the chosen one on those samples give the temperature that calibrates it. Then it is fitted to all training people.
+    The training people are again split by person: first the number of leading modes is chosen by LDA, then the
+    classifier and its parameters with this number, each by macro accuracy of the held-out samples. The probabilities of
+    the chosen classifier on those samples give the temperature that calibrates it. Then it is fitted to all training
+    people.
 
     Args:
-        folds: the outer folds.
-        classifiers: names of `CLASSIFIERS` to choose from; among equals the first is taken.
-        inner_folds: folds of the training people.
-        seed: of the inner folds and the classifiers.
+        folds: outer folds.
+        classifiers: names of `CLASSIFIERS` to choose from; the first of several equal ones is chosen.
+        inner_folds: number of folds of the training people.
+        seed: seed of the inner folds and the classifiers.
         modes: numbers of leading modes to choose from; None is all.
 
     Raises:
-        InputError: no folds, an unknown classifier, too few people, or a class in too few of them.
+        InputError: no folds, an unknown classifier, too few people, or a class with too few people.
     """
     classes = classes_of(folds)
-    refuse_unknown(classifiers)
+    check_classifiers(classifiers)
     if not classifiers or not modes:
         raise InputError("Nested cross-validation needs at least one classifier and one number of modes.")
-    with threadpool_limits(1):  # small matrices: more threads cost more than they give
-        results = [_nested(fold, classes, classifiers, inner_folds, seed, modes) for fold in folds]
+    with threadpool_limits(1):  # small matrices: more threads are slower
+        results = [_predict_fold(fold, classes, classifiers, inner_folds, seed, modes) for fold in folds]
     return _gather(folds, classes, results)
 
 
-def _nested(
+def _predict_fold(
     fold: Fold,
     classes: tuple[str, ...],
     names: Sequence[str],
@@ -213,7 +214,7 @@ def _nested(
     for name in names:
         for parameters in _grid(name):
             if int(parameters.get("classify__n_neighbors", 1)) > fewest:
-                continue  # so many neighbours there are not
+                continue  # more neighbours than samples
             probabilities = cross_validated_probabilities(
                 X=X[:, :m],
                 labels=labels,
@@ -227,7 +228,7 @@ def _nested(
             if best is None or accuracy > best[0] + 1e-12:
                 best = accuracy, name, parameters, probabilities
     if best is None:
-        raise InputError("None of the classifiers can be had with so few training samples; add samples.")
+        raise InputError("No classifier can be trained with so few samples; add samples.")
     accuracy, name, parameters, probabilities = best
     temperature = fit_temperature(labels.tolist(), probabilities, classes)
     fold_probabilities = predict_probabilities(
@@ -251,7 +252,7 @@ def fixed_predictions(
         InputError: no folds, or an unknown classifier.
     """
     classes = classes_of(folds)
-    refuse_unknown([classifier])
+    check_classifiers([classifier])
     results: list[tuple[FloatArray, Choice]] = []
     with threadpool_limits(1):
         for fold in folds:
@@ -281,15 +282,15 @@ def predict_probabilities(
 ) -> FloatArray:
     """Return probabilities (m, C) of `test` (m, K) by a classifier fitted to `X` (n, K).
 
-    Rows of `test` that are not finite give NaN; classes that the training samples lack have probability 0.
+    Rows of `test` that are not finite give NaN; classes without training samples have probability 0.
     """
     pipeline: Any = CLASSIFIERS[classifier](seed).set_params(**parameters)
     neighbours = int(getattr(pipeline[-1], "n_neighbors", 1))
     if neighbours > len(X):
-        raise InputError(f"{neighbours} nearest neighbours cannot be had among {len(X)} training samples; add samples.")
+        raise InputError(f"{neighbours} nearest neighbours need more than {len(X)} training samples; add samples.")
     finite = np.isfinite(test).all(axis=1)
     present = np.unique(np.asarray(labels, dtype=str))
-    if len(present) == 1:  # as happens in inner folds of very few people; several classifiers refuse it
+    if len(present) == 1:  # occurs in inner folds of very few people; several classifiers raise an error
         probabilities = np.full((len(test), len(classes)), np.nan)
         probabilities[finite] = 0.0
         probabilities[finite, list(classes).index(str(present[0]))] = 1.0
@@ -313,7 +314,7 @@ def cross_validated_probabilities(
     parameters: Mapping[str, Any],
     seed: int = 0,
 ) -> FloatArray:
-    """Return probabilities (n, C) of each sample by the classifier fitted to the folds that do not hold it."""
+    """Return probabilities (n, C) of each sample by the classifier fitted to the folds without it."""
     probabilities = np.full((len(X), len(classes)), np.nan)
     for train, test in folds:
         probabilities[test] = predict_probabilities(
@@ -329,7 +330,7 @@ def cross_validated_probabilities(
 
 
 def classes_of(folds: Sequence[Fold]) -> tuple[str, ...]:
-    """Return all classes in order, or raise InputError where there are fewer than two, or no folds."""
+    """Return all classes in order; raise InputError if there are fewer than two, or no folds."""
     if not folds:
         raise InputError("There are no folds to evaluate.")
     classes = sorted({label for fold in folds for label in (*fold.train_labels, *fold.test_labels)})
@@ -338,7 +339,7 @@ def classes_of(folds: Sequence[Fold]) -> tuple[str, ...]:
     return tuple(classes)
 
 
-def refuse_unknown(names: Sequence[str]) -> None:
+def check_classifiers(names: Sequence[str]) -> None:
     """Raise InputError for names that are not in `CLASSIFIERS`."""
     for name in names:
         if name not in CLASSIFIERS:
@@ -355,7 +356,7 @@ def usable_training_rows(fold: Fold) -> tuple[FloatArray, Any, Any]:
 
 
 def likeliest_classes(probabilities: FloatArray, classes: Sequence[str]) -> Any:
-    """Return the likeliest classes (n,); empty where a fit failed."""
+    """Return the likeliest classes (n,); empty if a fit failed."""
     undefined = np.isnan(probabilities).any(axis=1)
     best = np.where(np.isnan(probabilities), -1.0, probabilities).argmax(axis=1)
     return np.where(undefined, "", np.asarray(classes)[best])
@@ -399,8 +400,8 @@ class Calibration:
 
     Args:
         confidence: (B,) mean highest probability in each bin that is not empty.
-        accuracy: (B,) share of right answers there.
-        count: (B,) samples there.
+        accuracy: (B,) share of correct answers in each bin.
+        count: (B,) number of samples in each bin.
         expected_calibration_error: mean of |accuracy - confidence| over the samples (Guo et al., ICML 2017).
         brier: mean summed squared error of the probabilities, 0 to 2.
         log_loss: mean negative logarithm of the probability of the true class, nats.
@@ -419,10 +420,10 @@ class ClassScores:
     """Precision, recall and F1 score of one class.
 
     Args:
-        precision: share of right ones among those called so; NaN where none was.
-        recall: share of right ones among those that are so.
-        f1: their harmonic mean.
-        count: samples of the class.
+        precision: share of correct predictions among those of this class; NaN if there are none.
+        recall: share of correct predictions among the samples of this class.
+        f1: harmonic mean of precision and recall.
+        count: number of samples of the class.
     """
 
     precision: float
@@ -432,13 +433,13 @@ class ClassScores:
 
 
 def macro_accuracy(labels: Sequence[str] | Any, predicted: Sequence[str] | Any, classes: Sequence[str]) -> float:
-    """Return the mean over the classes of the share of their samples that were answered rightly.
+    """Return the mean over the classes of the share of their samples with a correct prediction.
 
-    Classes without a sample do not count; any answer but the right class is wrong, also none and "unsure".
+    Classes without a sample do not count; any answer except the true class is wrong, also none and "unsure".
     """
     truth, answers = np.asarray(labels, dtype=str), np.asarray(predicted, dtype=str)
     class_masks = [truth == name for name in classes]
-    # recall_score(average="macro") gives the same in 2 ms instead of 0.06, which is asked for by the thousand.
+    # recall_score(average="macro") gives the same in 2 ms instead of 0.06, and this runs thousands of times.
     recalls = [
         float((answers[is_member] == name).mean())
         for is_member, name in zip(class_masks, classes, strict=True)
@@ -475,7 +476,7 @@ def subject_bootstrap(
     seed: int = 0,
     level: float = 0.95,
 ) -> tuple[float, float]:
-    """Return the bootstrap percentile interval of the macro accuracy, drawing whole people with replacement.
+    """Return the bootstrap percentile interval of the macro accuracy, resampling people with all their samples.
 
     Near 0 and 1 it is at least as wide as the exact interval without an error among as many people as show the rarest
     class.
@@ -504,7 +505,7 @@ def calibration(
     Raises:
         InputError: arrays that do not belong together, or no row with probabilities.
     """
-    truth, p = _with_probabilities(labels, probabilities, classes)
+    truth, p = _select_finite(labels, probabilities, classes)
     confidence, right = p.max(axis=1), p.argmax(axis=1) == truth
     bin_index = np.minimum((confidence * bins).astype(np.int64), bins - 1)
     count = np.bincount(bin_index, minlength=bins)
@@ -525,13 +526,13 @@ def calibration(
 def fit_temperature(labels: Sequence[str], probabilities: FloatArray, classes: Sequence[str]) -> float:
     """Return the temperature that maximises the likelihood of held-out probabilities (n, C) (Guo et al., ICML 2017).
 
-    The true class counts for 1 - 1 / (n + 2), as in Platt's calibration (1999): few samples that all are right do not
-    show that the next is.
+    The true class counts for 1 - 1 / (n + 2), as in Platt's calibration (1999): a few samples that are all correct do
+    not ensure that the next one is.
 
     Raises:
         InputError: arrays that do not belong together, or no row with probabilities.
     """
-    truth, p = _with_probabilities(labels, probabilities, classes)
+    truth, p = _select_finite(labels, probabilities, classes)
     logits = np.log(np.maximum(p, _LEAST_PROBABILITY))
     return likeliest_temperature(logits, truth, doubt=1 / (len(p) + 2), bounds=(0.1, 100.0))
 
@@ -542,7 +543,7 @@ def calibrated(probabilities: FloatArray, temperature: float) -> FloatArray:
     return np.asarray(softmax(logits / temperature, axis=1), dtype=np.float64)
 
 
-def _with_probabilities(labels: Sequence[str], probabilities: FloatArray, classes: Sequence[str]) -> tuple[Any, Any]:
+def _select_finite(labels: Sequence[str], probabilities: FloatArray, classes: Sequence[str]) -> tuple[Any, Any]:
     if probabilities.shape != (len(labels), len(classes)):
         raise InputError(
             f"{len(labels)} labels of {len(classes)} classes need probabilities of that shape, not "
@@ -551,7 +552,7 @@ def _with_probabilities(labels: Sequence[str], probabilities: FloatArray, classe
     column = {name: k for k, name in enumerate(classes)}
     unknown = sorted(set(labels) - set(column))
     if unknown:
-        raise InputError(f"The label {unknown[0]!r} is none of the classes.")
+        raise InputError(f"The label {unknown[0]!r} is not among the classes.")
     finite = np.isfinite(probabilities).all(axis=1)
     if not finite.any():
         raise InputError("There is no sample with probabilities, so they cannot be compared with the labels.")

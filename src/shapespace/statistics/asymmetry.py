@@ -1,9 +1,9 @@
-"""How symmetric objects are: Procrustes ANOVA with object symmetry, and how far each is from its own mirror image.
+"""Asymmetry of objects: Procrustes ANOVA with object symmetry, and the distance of each shape from its mirror image.
 
 Klingenberg, Barluenga and Meyer, Evolution 56(10), 2002; Mardia, Bookstein and Moreton, Biometrika 87(2), 2000;
 Klingenberg, Symmetry 7(2), 2015. Every shape and its mirror image in correspondence are superimposed together. Half
-their sum is the symmetric part of a shape, half their difference the asymmetric one; here the whole difference is
-given, which is how far the sides are apart.
+their sum is the symmetric part of a shape, half their difference the asymmetric one; this module returns the full
+difference, which is the distance between the sides.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ _BLOCK = 100  # permutations at a time; bounds memory and spaces the progress me
 _HEIGHT_OFF = 2.0
 """Error of the height of the surface above a triangle, as a share of the height: curvature differs at its corners."""
 _FEWEST = 3  # subjects; two leave one degree of freedom
-_Tested: TypeAlias = tuple[float | None, float | None]
+_PAndZ: TypeAlias = tuple[float | None, float | None]
 """p and Z."""
-_UNTESTED: _Tested = None, None
+_UNTESTED: _PAndZ = None, None
 _MOSTLY = 0.5
 """Share of the shapes of a subject that must observe a vertex, so that it counts as observed."""
 
@@ -53,13 +53,14 @@ class AnovaRow:
     """A row of the Procrustes ANOVA; sums of squares over all vertices of all shapes and their images.
 
     Args:
-        source: `individual`, `side`, `individual x side`, or the measurement error of either part; the sum of the two
-            errors is the row of Klingenberg, who takes error to be alike in all directions.
+        source: name of the effect: `individual`, `side`, `individual x side`, or the measurement error of either part;
+            the sum of the two errors is the row of Klingenberg, who assumes equal error in all directions.
         ss: sum of squares, mm^2.
         df: degrees of freedom: those of the subjects times the dimensions of the shapes (Klingenberg 2002).
-        ms: ss / df.
-        f: over `individual x side`, or for that over the asymmetric error; None where there is nothing to compare with.
-        p: by permutation; None where nothing can be permuted.
+        ms: mean square, ss / df.
+        f: ms divided by that of `individual x side`, or for that row by that of the asymmetric error; None without a
+            divisor.
+        p: p value by permutation; None if nothing can be permuted.
         z: F in standard deviations of its permutation distribution, after a Box-Cox transformation; None without p.
         r2: share of the total sum of squares.
     """
@@ -76,13 +77,14 @@ class AnovaRow:
 
 @dataclass(frozen=True, eq=False)
 class AsymmetryScores:
-    """How far each of n subjects is from its own mirror image, RMS over the vertices.
+    """Distance of each of n subjects from its own mirror image, RMS over the vertices.
 
     Args:
-        mm: (n,) less measurement error where that is known, which is what two images of a subject differ by.
-        low, high: (n,) its 95 % interval, by repeated shapes and by the uncertainty of fits; NaN without either.
-        raw_mm: (n,) as measured.
-        error_mm: what the error alone would be taken for in one shape, RMS; NaN where it is not known.
+        mm: (n,) distance less the measurement error, if that is known from repeated shapes.
+        low, high: (n,) ends of the 95 % interval, by repeated shapes and by the uncertainty of fits; NaN without
+            either.
+        raw_mm: (n,) distance as measured.
+        error_mm: RMS distance that measurement error alone causes in one shape; NaN if not known.
     """
 
     mm: FloatArray
@@ -96,37 +98,37 @@ class AsymmetryScores:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AsymmetryResult(AnalysisResult):
-    """What the sides of n subjects differ by.
+    """Differences between the sides of n subjects.
 
     Args:
-        cohort: the N shapes.
-        sides: of the object, M vertices.
-        subjects: n names.
-        counts: (n,) shapes of each.
+        cohort: cohort of the N shapes.
+        sides: sides of the object, with M vertices.
+        subjects: names of the n subjects.
+        counts: (n,) number of shapes of each subject.
         mean: (M, 3) the symmetric mean, mm.
-        normals: (M, 3) of it; None for points.
+        normals: (M, 3) normals of the mean; None for points.
         symmetric: (n, M, 3) the symmetric part of each subject, mm.
         difference: (n, M, 3) each subject less its mirror image, mm: twice the asymmetric part.
-        anova: individual, side, individual x side and, with repeated shapes, measurement error.
-        scores: along the normals where there are any, else over all directions.
-        vertex_scores: over all directions.
-        z: (n,) scores in standard deviations of the reference group, a member being compared with the others.
-        z_low, z_high: (n,) with the interval of the scores.
+        anova: rows of the ANOVA: individual, side, individual x side and, with repeated shapes, measurement error.
+        scores: scores along the normals if there are any, else over all directions.
+        vertex_scores: scores over all directions.
+        z: (n,) scores in standard deviations of the reference group; a member is compared with the other members.
+        z_low, z_high: (n,) ends of the interval of `z`, from that of the scores.
         in_reference: (n,) whether a subject is of that group.
-        directional: (M,) mm, mean difference along the normals; its length, for points.
-        directional_p: (M,) family-wise, by flipping signs.
-        permutations: how many.
-        seed: of them.
+        directional: (M,) mean difference along the normals, mm; its length, for points.
+        directional_p: (M,) family-wise p of `directional`, by flipping signs.
+        permutations: number of permutations.
+        seed: seed of the permutations.
         observed: (n, M) bool, False where a subject's vertex, or its mirror image, is an estimate in most of its
             shapes; None if all are observed.
-        size_anova: the same rows for the centroid sizes of separate sides, with the degrees of freedom of
+        size_anova: rows of the ANOVA of the centroid sizes of separate sides, with the degrees of freedom of
             `observations`.
-        degrees_of_freedom: of the ANOVA of shape.
-        imputations: those that p values combine; None without samples of completed shapes.
+        degrees_of_freedom: kind of the degrees of freedom of the ANOVA of shape.
+        imputations: imputations that p values combine; None without samples of completed shapes.
 
     Example:
-        >>> whole = ss.Cohort.of_shapes([mesh.vertices for mesh in meshes], {}, faces=meshes[0].faces)
-        >>> result = ss.statistics.measure_asymmetry(whole, permutations=99)
+        >>> surfaces = ss.Cohort.of_shapes([mesh.vertices for mesh in meshes], {}, faces=meshes[0].faces)
+        >>> result = ss.statistics.measure_asymmetry(surfaces, permutations=99)
         >>> len(result.subjects)
         6
     """
@@ -168,12 +170,12 @@ class AsymmetryResult(AnalysisResult):
 
     @cached_property
     def maps(self) -> FloatArray:
-        """(n, M) mm: how far each subject stands out of its mirror image along the normals; lengths, for points."""
-        return _along(self.difference, self.normals)
+        """(n, M) distance of each subject outside its mirror image along the normals, mm; lengths, for points."""
+        return _along_normals(self.difference, self.normals)
 
     @cached_property
     def fluctuating(self) -> FloatArray:
-        """(M,) mm: standard deviation of `maps` over the subjects, about the directional asymmetry."""
+        """(M,) standard deviation of `maps` over the subjects, about the directional asymmetry, mm."""
         if self.normals is None:
             off = self.difference - self.difference.mean(axis=0)
             return np.sqrt((off**2).sum(axis=(0, 2)) / (len(off) - 1))
@@ -187,7 +189,7 @@ class AsymmetryResult(AnalysisResult):
             count = 1 + self.permutations
             flipped = ("side", "directional asymmetry of each vertex")
             tests.append(TestScheme(tested=flipped, resampling="sign flips", reduced_model=None, arrangements=count))
-            tested = [one.source for one in self.anova if one.p is not None and one.source != "side"]
+            tested = [row.source for row in self.anova if row.p is not None and row.source != "side"]
             if _exchanges_sides(self.sides, self.degrees_of_freedom):
                 unit = "mean of a side of a subject"
                 tests.append(TestScheme(tested=("individual",), unit=unit, reduced_model=None, arrangements=count))
@@ -240,28 +242,28 @@ def measure_asymmetry(
     drop_missing: bool = False,
     progress: Progress | None = None,
 ) -> AsymmetryResult:
-    """Return what the sides of the objects of a cohort differ by.
+    """Measure the differences between the sides of the objects of a cohort.
 
     If completed shapes have samples, each imputation is tested too, and p values combine them by Rubin's rules.
 
     Args:
-        cohort: the shapes; in the gauge `form` millimetres are those of each object.
+        cohort: cohort of the shapes; in the gauge `form` millimetres are those of each object.
         subject: column of the subjects; several shapes of a subject measure the measurement error (default: `subject`,
             if the table has it; otherwise each shape is of another subject).
-        pairs: of vertices that mirror each other, one on the plane beside itself; None finds them on the mean.
-        where: what the pairs are called in messages.
-        side: column of the sides where they are separate shapes, such as left and right wings (matching symmetry);
-            None for symmetric objects.
+        pairs: pairs of vertices that mirror each other, a vertex on the plane with itself (default: found on the mean).
+        where: name of the pairs in messages.
+        side: column of the sides if they are separate shapes, such as left and right wings (matching symmetry); None
+            for symmetric objects.
         reference: column and value of the subjects that scores are compared with; None for all.
-        degrees_of_freedom: of the ANOVA: those of the subjects times the dimensions of the shapes (`klingenberg`), or
-            those of the `observations` alone, as in geomorph.
+        degrees_of_freedom: kind of the degrees of freedom of the ANOVA: those of the subjects times the dimensions of
+            the shapes (`klingenberg`), or those of the `observations` alone, as in geomorph.
         permutations: number of permutations for p; 0 for none.
         seed: seed of the permutations.
         drop_missing: exclude shapes with missing values in the table (default: an error).
-        progress: called with (permutations done, in all).
+        progress: function called with (permutations done, in all).
 
     Raises:
-        InputError: an object without mirror symmetry, pairs that cannot be, fewer than three subjects, no such column,
+        InputError: an object without mirror symmetry, invalid pairs, fewer than three subjects, no such column,
             a subject in two groups, or a reference group of fewer than three.
     """
     require(cohort, Cohort, "measure_asymmetry", "read one with shapespace.read_cohort")
@@ -293,11 +295,11 @@ def _measure_sides(
     *,
     progress: Progress | None,
 ) -> AsymmetryResult:
-    """Return what the given sides of the objects of a cohort differ by; arguments as of `measure_asymmetry`."""
+    """Return the differences between given sides of a cohort's objects; for the arguments see `measure_asymmetry`."""
     if sides.classes:
         first, both = cohort.take(range(len(cohort) // 2)), np.stack([cohort.vertices(k) for k in range(len(cohort))])
     else:
-        first, both = cohort, _with_images(cohort, sides)
+        first, both = cohort, _add_images(cohort, sides)
     names, codes = _subjects(first, subject)
     in_reference = _in_reference(first, names, codes, reference)
     symmetric, difference, mean = _split(first, sides, both)
@@ -311,18 +313,18 @@ def _measure_sides(
     rng = np.random.default_rng(seed)
 
     subjects = _Subjects(codes, counts)
-    along = _along(difference, normals) if normals is not None else difference
+    along = _along_normals(difference, normals) if normals is not None else difference
     own, own_difference = subjects.means(along), subjects.means(difference)
     asymmetry = own[..., None] * normals if normals is not None else own
     fitted = cohort if not sides.classes else replace(first, fitted=None)
     scores = _scores(along, subjects, _shared_error(fitted, sides, mean, asymmetry, subjects))
     vertex_scores = _scores(difference, subjects, _shared_error(fitted, sides, mean, own_difference, subjects))
-    z, z_low, z_high = _standardised(scores, in_reference)
+    z, z_low, z_high = _standardise(scores, in_reference)
     steps = _Steps(4 * permutations, progress)
     parts = symmetric, difference
     if normals is not None and not sides.paired:
-        # Places nearest on the mean leave its sides no difference along the surface, which single shapes have.
-        parts = _along(symmetric, normals), along
+        # If each vertex is paired with the place nearest on the mean, differences along the surface cannot be measured.
+        parts = _along_normals(symmetric, normals), along
     exchange = _exchanges_sides(sides, degrees_of_freedom)
     if degrees_of_freedom == "klingenberg":
         dimensions = sides.dimensions(scaled=cohort.gauge == "shape")
@@ -341,7 +343,7 @@ def _measure_sides(
         # Signs do not change the weights, so permutations stay exchangeable.
         known = _known_beyond(own, heights)
         weight = known if weight is None else weight * known
-    p = _family_wise(own, rng, steps, weight)
+    p = _family_wise_p(own, rng, steps, weight)
     return AsymmetryResult(
         cohort=cohort, sides=sides, subjects=names, counts=counts, mean=mean, normals=normals,
         symmetric=subjects.means(symmetric), difference=own_difference, observed=observed,
@@ -423,7 +425,7 @@ def _in_reference(
     return share > 0
 
 
-def _with_images(cohort: Cohort, sides: Sides) -> FloatArray:
+def _add_images(cohort: Cohort, sides: Sides) -> FloatArray:
     """Return N shapes and their mirror images (2N, M, 3), superimposed."""
     n = len(cohort)
     both = np.empty((2 * n, len(sides), 3))
@@ -461,7 +463,7 @@ def _pairs_observed(cohort: Cohort, sides: Sides) -> BoolArray | None:
     return np.logical_and(own, image)
 
 
-def _along(difference: FloatArray, normals: FloatArray | None) -> FloatArray:
+def _along_normals(difference: FloatArray, normals: FloatArray | None) -> FloatArray:
     if normals is None:
         return np.linalg.norm(difference, axis=-1)
     return np.einsum("nvd,vd->nv", difference, normals)
@@ -504,7 +506,7 @@ def _anova(
         p_individual = _p_permuting(gram_s, between, rng, steps) if repeated else _UNTESTED
     total = individual + side + both + error_s + error_d
 
-    def row(source: str, ss: float, df: float, f: float | None = None, p: _Tested = _UNTESTED) -> AnovaRow:
+    def row(source: str, ss: float, df: float, f: float | None = None, p: _PAndZ = _UNTESTED) -> AnovaRow:
         return AnovaRow(source, ss, df, ss / df, f, *p, r2=ss / max(total, 1e-300))
 
     df_subject, df_both, df_error = (n - 1) * d_sym, (n - 1) * d_asym, (rows - n) * d_asym
@@ -527,7 +529,7 @@ def _pooled_anova(
     symmetric: FloatArray, difference: FloatArray, subjects: _Subjects, rng: np.random.Generator, steps: _Steps, *,
     exchange_sides: bool,
 ) -> tuple[AnovaRow, ...]:  # fmt: skip
-    """Return an ANOVA of one dimension with the errors of both parts pooled, as geomorph has it."""
+    """Return an ANOVA of one dimension with the errors of both parts pooled, as in geomorph."""
     anova = _anova(symmetric, difference, subjects, (1.0, 1.0), rng, steps, exchange_sides=exchange_sides)
     rows, errors = list(anova[:3]), anova[3:]
     if errors:
@@ -541,14 +543,14 @@ def _f_ratio(ms: float, error: float) -> float | None:
     return ms / error if error > 0 else None
 
 
-def _p_and_z(draw: Callable[[int], FloatArray], observed: float, total: float, steps: _Steps) -> _Tested:
+def _p_and_z(draw: Callable[[int], FloatArray], observed: float, total: float, steps: _Steps) -> _PAndZ:
     """Return the share of arrangements with as large a statistic as the observed one, and the effect size of F.
 
     Args:
-        draw: the statistics (k,) of k random arrangements.
-        observed: that of the data.
-        total: sum of the statistic and what F divides it by, in all arrangements.
-        steps: called after each block.
+        draw: function that returns the statistics (k,) of k random arrangements.
+        observed: statistic of the data.
+        total: sum of the statistic and the divisor of F, the same in all arrangements.
+        steps: counter of permutations, advanced after each block.
     """
     if not steps.each:
         return _UNTESTED
@@ -561,8 +563,8 @@ def _p_and_z(draw: Callable[[int], FloatArray], observed: float, total: float, s
     return float((statistic >= observed * (1 - 1e-12)).mean()), effect_size(f)
 
 
-def _p_flipping(gram: FloatArray, total: float, rng: np.random.Generator, steps: _Steps) -> _Tested:
-    """Test the mean of vectors by random signs; `gram` (n, n) is theirs."""
+def _p_flipping(gram: FloatArray, total: float, rng: np.random.Generator, steps: _Steps) -> _PAndZ:
+    """Test the mean of vectors by random signs; `gram` (n, n) contains their inner products."""
 
     def draw(count: int) -> FloatArray:
         signs = rng.choice([-1.0, 1.0], (count, len(gram)))
@@ -571,8 +573,8 @@ def _p_flipping(gram: FloatArray, total: float, rng: np.random.Generator, steps:
     return _p_and_z(draw, float(gram.sum()), total, steps)
 
 
-def _p_permuting(gram: FloatArray, between: FloatArray, rng: np.random.Generator, steps: _Steps) -> _Tested:
-    """Test whether subjects differ by permutation of shapes; `gram` (N, N) is of centred shapes."""
+def _p_permuting(gram: FloatArray, between: FloatArray, rng: np.random.Generator, steps: _Steps) -> _PAndZ:
+    """Test whether subjects differ by permutation of shapes; `gram` (N, N) has inner products of centred shapes."""
 
     def draw(count: int) -> FloatArray:
         orders = [rng.permutation(len(gram)) for _ in range(count)]
@@ -583,17 +585,17 @@ def _p_permuting(gram: FloatArray, between: FloatArray, rng: np.random.Generator
 
 def _p_exchanging(
     middle: FloatArray, half: FloatArray, counts: npt.NDArray[np.intp], rng: np.random.Generator, steps: _Steps
-) -> _Tested:
+) -> _PAndZ:
     """Test whether the two sides of a subject are alike by pairing them with sides of other subjects.
 
-    Unlike permutations of all shapes, this keeps what a subject's sides differ by, which F divides by.
+    Unlike permutations of all shapes, this keeps the difference between a subject's sides, which is the divisor of F.
 
     Args:
         middle: (n, K) mean of the two sides of each subject, centred.
         half: (n, K) half of their difference, centred.
-        counts: (n,) shapes of a side.
-        rng: of the permutations.
-        steps: called after each block.
+        counts: (n,) number of shapes per side.
+        rng: random generator of the permutations.
+        steps: counter of permutations, advanced after each block.
     """
     share = counts / counts.sum()
     one, other = (side - share @ side for side in (middle + half, middle - half))
@@ -615,12 +617,12 @@ def _p_exchanging(
 
 
 def _known_beyond(own: FloatArray, heights: FloatArray) -> FloatArray:
-    """Return the weights (M,) of vertices whose differences `own` (n, M) vary more than the heights (M,) may be off."""
+    """Return weights (M,) of vertices, by how far differences `own` (n, M) exceed the possible error of `heights`."""
     squares = (own**2).mean(axis=0)
     return squares / np.maximum(squares + (_HEIGHT_OFF * heights) ** 2, 1e-300)
 
 
-def _family_wise(
+def _family_wise_p(
     own: FloatArray, rng: np.random.Generator, steps: _Steps, weight: FloatArray | None = None
 ) -> FloatArray:
     """Return p (M,) of the mean of fields (n, M) or (n, M, 3), by the permutation maximum over random signs.
@@ -650,7 +652,7 @@ def _shared_error(
 ) -> FloatArray | None:
     """Return the variance (n,), mm^2, of the length of asymmetries (n, M, 3) by the uncertainty of their fits.
 
-    All scans of a subject share most of this error, as the model lacks the same of each; None where nothing was fitted.
+    All scans of a subject share most of this error, as the model's deficits are the same for each; None without fits.
     """
     fitted = cohort.fitted
     if fitted is None:
@@ -683,13 +685,13 @@ def _scores(fields: FloatArray, subjects: _Subjects, shared: FloatArray | None) 
         off = flat - own[subjects.codes]
         gram = off @ off.T
         trace = float(np.trace(gram)) / df
-        # What the sample covariance squared has too much of, with df degrees of freedom (Bai and Saranadasa 1996).
+        # Correction of the squared sample covariance for its bias with df degrees of freedom (Bai and Saranadasa 1996).
         squared = (float((gram**2).sum()) - df * trace**2) / max((df - 1) * (df + 2), 1)
         squared = max(squared, trace**2 / flat.shape[1])
         along = ((own @ off.T) ** 2).sum(axis=1) / df
     of_mean, of_mean_squared = trace / subjects.counts, squared / subjects.counts**2
     net = squares - of_mean  # S36
-    # A mean lies partly along its own error, which scatters it less than it seems.
+    # A mean lies partly along its own error, so that the error scatters it less than the formula states.
     steep = np.maximum(along / subjects.counts - of_mean_squared, 0.0) / np.maximum(net, 1e-30)
     steep = np.where(net > 0, np.minimum(steep, np.sqrt(of_mean_squared)), 0.0)
     steep = steep if shared is None else steep + shared
@@ -706,8 +708,8 @@ def _scores(fields: FloatArray, subjects: _Subjects, shared: FloatArray | None) 
     return AsymmetryScores(mm(net), low, high, read_only(raw), error)
 
 
-def _standardised(scores: AsymmetryScores, group: npt.NDArray[np.bool_]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return z, low and high (n,) of scores beside those of the group, of which nobody is compared with itself."""
+def _standardise(scores: AsymmetryScores, group: npt.NDArray[np.bool_]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return z, low and high (n,) of scores against those of the group; a member is compared with the other members."""
     inside = scores.mm[group]
     n, total, square = len(inside), inside.sum(), (inside**2).sum()
     less = group.astype(np.float64)
@@ -726,8 +728,8 @@ def first_pattern(result: AsymmetryResult) -> tuple[FloatArray, float, FloatArra
     """Return the first principal pattern of fluctuating asymmetry.
 
     Returns:
-        (M, 3) mm, what one standard deviation of it adds to the difference; its share of the variance; (n,) how much
-        of it each subject has, in standard deviations.
+        (M, 3) change of the difference by one standard deviation of the pattern, mm; its share of the variance; (n,)
+        score of each subject, in standard deviations.
     """
     off: Any = (result.difference - result.difference.mean(axis=0)).reshape(len(result.subjects), -1)
     value, vector = np.linalg.eigh(off @ off.T)

@@ -1,4 +1,4 @@
-"""Rigid alignment of a surface to itself at another time, by what did not change: named, or found robustly."""
+"""Rigid alignment of a surface to itself at another time, by the part that did not change: named, or found robustly."""
 
 from __future__ import annotations
 
@@ -17,53 +17,53 @@ from shapespace.model.shape_model import region_vertices
 from shapespace.types import FloatArray, IntArray, Similarity, SurfaceLandmarks
 
 SEARCHED = 1500
-"""Vertices among which the stable part is searched."""
+"""Number of vertices among which the stable part is searched."""
 KEPT_SHARE = 0.4
-"""Share of the surface that must be unchanged for it to be found."""
+"""Share of the surface that must be unchanged, so that it can be found."""
 NEAR_MM = 10.0
-"""How near to a landmark vertices are taken, where nothing else is said."""
+"""Largest distance of vertices from a landmark, by default."""
 _PATCHES, _PATCH_SHARE = 24, 0.15  # patches that alignments start from, and their share of the points
 _FIRST_STEPS, _GO_ON, _STEPS = 3, 4, 20
-"""All starts take a few steps, and the best of them go on."""
+"""Steps of all starts, number of the best starts that continue, and their steps."""
 _FEWEST = 3  # vertices that determine a rigid transformation
 _CUTOFF = 5.5
-"""Residuals beyond so many standard deviations count nothing: Tukey's biweight, 95 % efficient in three dimensions."""
+"""Number of standard deviations beyond which residuals have no weight: Tukey's biweight, 95 % efficient in 3-D."""
 _ROUNDS = 10  # reweighting iterations
 _SMALLEST = 1e-9  # share of the size; keeps the spread of identical surfaces above zero
 
 
 def stable_vertices(cohort: Cohort, stable: str | Path | Sequence[int]) -> IntArray | None:
-    """Return the vertices that carry the alignment, each once; None where they are to be found.
+    """Return the vertices that carry the alignment, each once; None if they are to be found.
 
     Args:
-        cohort: whose surfaces they are of.
+        cohort: cohort of the surfaces.
         stable: `auto` finds them, `all` takes all; the name of a region of the model; a file of vertices;
             `landmarks:NAME,NAME,...`, which may end in a radius in mm, for the vertices near these; or the vertices.
 
     Raises:
         FileError: the file cannot be read.
-        FileFormatError: it is no list of vertices.
+        FileFormatError: the file is no list of vertices.
         InputError: there is no such region, landmark, file or vertex, or fewer than three vertices.
     """
     if not isinstance(stable, (str, Path)):
-        return _several(region_vertices(stable, cohort.n_vertices, "stable"), "those given")
+        return _check_enough_vertices(region_vertices(stable, cohort.n_vertices, "stable"), "those given")
     text = str(stable)
     if text == "auto":
         return None
     if text == "all":
         return np.arange(cohort.n_vertices, dtype=np.int32)
     if text.startswith("landmarks:"):
-        return _several(_near_landmarks(cohort, text), text)
+        return _check_enough_vertices(_near_landmarks(cohort, text), text)
     regions: Mapping[str, IntArray] = {} if cohort.fitted is None else cohort.fitted.model.regions
     if text in regions:
-        return _several(regions[text], text)
+        return _check_enough_vertices(regions[text], text)
     if not Path(text).is_file():
         known = f"the model's regions are {', '.join(regions)}" if regions else "there is no model with regions"
         raise InputError(
             f"There is no stable region {text!r} ({known}), and no such file; give auto, all, a file of vertices, or "
             "landmarks:NAME,NAME."
         )
-    return _several(region_vertices(read_region(text), cohort.n_vertices, text), text)
+    return _check_enough_vertices(region_vertices(read_region(text), cohort.n_vertices, text), text)
 
 
 def _near_landmarks(cohort: Cohort, text: str) -> IntArray:
@@ -81,7 +81,7 @@ def _near_landmarks(cohort: Cohort, text: str) -> IntArray:
     return np.flatnonzero(away <= radius_mm).astype(np.int32)
 
 
-def _several(vertices: IntArray, name: str) -> IntArray:
+def _check_enough_vertices(vertices: IntArray, name: str) -> IntArray:
     if len(vertices) < _FEWEST:
         raise InputError(f"The stable region {name} has {len(vertices)} vertices, and three are the least.")
     return vertices
@@ -90,13 +90,13 @@ def _several(vertices: IntArray, name: str) -> IntArray:
 def align_by(moving: FloatArray, fixed: FloatArray, area: FloatArray, stable: IntArray | None) -> tuple[
     Similarity, FloatArray
 ]:  # fmt: skip
-    """Return the rigid motion of `moving` onto `fixed` by what is stable, and the weights (V,) that it went by.
+    """Return the rigid motion of `moving` onto `fixed` by the stable part, and the weights (V,) of the vertices in it.
 
     Args:
-        moving: (V, 3) mm.
-        fixed: (V, 3) mm, in correspondence.
-        area: (V,) of each vertex.
-        stable: vertices that are; None finds them (`align_robustly`).
+        moving: (V, 3) vertices, mm.
+        fixed: (V, 3) corresponding vertices, mm.
+        area: (V,) area of each vertex.
+        stable: stable vertices; None finds them (`align_robustly`).
 
     Raises:
         InputError: the stable vertices lie on a line.
@@ -109,16 +109,17 @@ def align_by(moving: FloatArray, fixed: FloatArray, area: FloatArray, stable: In
 
 
 def align_robustly(moving: FloatArray, fixed: FloatArray, area: FloatArray) -> tuple[Similarity, FloatArray]:
-    """Return the rigid motion of `moving` onto `fixed` by the part that keeps its shape, and the weights it went by.
+    """Return the rigid motion of `moving` onto `fixed` by the part that keeps its shape, and the vertex weights (V,).
 
-    Least trimmed squares (Rousseeuw and Van Driessen, Data Mining and Knowledge Discovery 12, 2006): from the whole
-    surface and from patches of it, fits and the `KEPT_SHARE` of the surface that they bring nearest take turns; the
-    start that ends nearest wins. From there on Tukey's biweight with the spread found takes in all that is unchanged.
+    Least trimmed squares (Rousseeuw and Van Driessen, Data Mining and Knowledge Discovery 12, 2006): starting from all
+    points and from patches, fits alternate with the selection of the `KEPT_SHARE` of the surface that is nearest; the
+    start with the smallest final distance wins. Tukey's biweight with the spread of this fit then includes all
+    unchanged vertices.
 
     Args:
-        moving: (V, 3) mm.
-        fixed: (V, 3) mm, in correspondence.
-        area: (V,) of each vertex, with which it counts.
+        moving: (V, 3) vertices, mm.
+        fixed: (V, 3) corresponding vertices, mm.
+        area: (V,) area of each vertex, its weight.
 
     Raises:
         InputError: the vertices lie on a line.
@@ -129,8 +130,8 @@ def align_robustly(moving: FloatArray, fixed: FloatArray, area: FloatArray) -> t
     else:
         p, q, a = moving, fixed, area
     a = a / a.sum()
-    ends = sorted((_trimmed(p, q, a, start, _FIRST_STEPS) for start in _starts(q)), key=lambda end: end.squares)
-    T = min((_trimmed(p, q, a, end.chosen, _STEPS) for end in ends[:_GO_ON]), key=lambda end: end.squares).T
+    ends = sorted((_fit_trimmed(p, q, a, start, _FIRST_STEPS) for start in _starts(q)), key=lambda end: end.squares)
+    T = min((_fit_trimmed(p, q, a, end.chosen, _STEPS) for end in ends[:_GO_ON]), key=lambda end: end.squares).T
     residual = np.linalg.norm(T.apply(p) - q, axis=1)
     size_mm = float(np.linalg.norm(np.ptp(fixed, axis=0)))
     order = np.argsort(residual, kind="stable")
@@ -145,7 +146,7 @@ def align_robustly(moving: FloatArray, fixed: FloatArray, area: FloatArray) -> t
 
 
 def _starts(points: FloatArray) -> list[IntArray]:
-    """Return the whole of `points` (n, 3), and patches about some that lie far apart."""
+    """Return all indices of `points` (n, 3), and those of patches about points that lie far apart."""
     count = max(round(_PATCH_SHARE * len(points)), _FEWEST + 1)
     seed = int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmax())
     away = np.full(len(points), np.inf)
@@ -158,7 +159,7 @@ def _starts(points: FloatArray) -> list[IntArray]:
     return starts
 
 
-class _End(NamedTuple):
+class _TrimmedFit(NamedTuple):
     """A rigid motion, the points that it brings nearest, and their mean squared distance."""
 
     T: Similarity
@@ -166,8 +167,8 @@ class _End(NamedTuple):
     squares: float
 
 
-def _trimmed(p: FloatArray, q: FloatArray, area: FloatArray, chosen: IntArray, steps: int) -> _End:
-    """Return where fits to the nearest `KEPT_SHARE` of the points end, from those `chosen`."""
+def _fit_trimmed(p: FloatArray, q: FloatArray, area: FloatArray, chosen: IntArray, steps: int) -> _TrimmedFit:
+    """Alternate fits and selections of the nearest `KEPT_SHARE` of the points, from those `chosen`, until both stop."""
     T, squares = Similarity.identity(), np.inf
     for _ in range(steps):
         try:
@@ -181,4 +182,4 @@ def _trimmed(p: FloatArray, q: FloatArray, area: FloatArray, chosen: IntArray, s
         if now >= squares:
             break
         squares, chosen = now, nearest
-    return _End(T, chosen, squares)
+    return _TrimmedFit(T, chosen, squares)

@@ -1,4 +1,4 @@
-"""What a surface did from visit to visit: displacement along its normals, volume swept, and what is known of both."""
+"""Changes of a surface from visit to visit: displacement along its normals, volume swept, and their uncertainty."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from shapespace.statistics.change_visits import Visit
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, SurfaceLandmarks
 
 _RIGID = 6
-"""Of the poses: turns and shifts."""
+"""Number of rigid poses: rotations and translations."""
 
 
 @dataclass(frozen=True, eq=False)
 class AlignedVisits:
-    """The scans of one subject, aligned on what is stable.
+    """The scans of one subject, aligned by the stable part.
 
     Args:
-        visits: of the subject.
-        scans: for each visit the (n, V, 3) surfaces of its scans, mm.
-        means: (T, V, 3) their mean at each visit.
-        normals: (V, 3) of the first of these.
-        weights: (V,) by which the last scan was aligned.
+        visits: visits of the subject.
+        scans: (n, V, 3) surfaces of the scans of each visit, mm.
+        means: (T, V, 3) mean surface of each visit, mm.
+        normals: (V, 3) normals of the first mean surface.
+        weights: (V,) weights of the vertices in the alignment of the last scan.
         observed: (V,) bool, whether all scans observe a vertex; None if they observe all.
     """
 
@@ -45,7 +45,7 @@ class AlignedVisits:
 
 
 def align_visits(cohort: Cohort, visits: Sequence[Visit], stable: IntArray | None) -> AlignedVisits:
-    """Return the scans of one subject, all brought to the first by what is stable.
+    """Align all scans of one subject to the first by the stable part.
 
     Raises:
         InputError: the stable vertices lie on a line.
@@ -72,17 +72,17 @@ def align_visits(cohort: Cohort, visits: Sequence[Visit], stable: IntArray | Non
 
 
 def faces_in(cohort: Cohort) -> IntArray:
-    """Return the triangles of a cohort that has some."""
+    """Return the triangles of a cohort that must have some."""
     assert cohort.faces is not None
     return cohort.faces
 
 
 def swept_mm3(before: FloatArray, after: FloatArray, faces: IntArray) -> FloatArray:
-    """Return the volume (V,) that each vertex sweeps from `before` (V, 3) to `after` on straight ways, outwards +.
+    """Return the volume (V,) that each vertex sweeps from `before` (V, 3) to `after` along straight lines, outwards +.
 
-    That of a triangle counts a third for each of its corners. The sum is exact, and of closed surfaces the difference
-    of the volumes: at each moment a triangle sweeps its area vector times its mean velocity, which is quadratic in
-    time, so that Simpson's rule has no error.
+    The volume of a triangle counts a third for each of its corners. The sum is exact, and for closed surfaces it is the
+    difference of the volumes: at each moment a triangle sweeps its area vector times its mean velocity, which is
+    quadratic in time, so that Simpson's rule has no error.
     """
     moved = after - before
     corners: FloatArray = moved[faces].sum(axis=1) / 3.0
@@ -93,7 +93,7 @@ def swept_mm3(before: FloatArray, after: FloatArray, faces: IntArray) -> FloatAr
 
 
 def contrast(visits: Sequence[Visit], *, rate: bool) -> FloatArray:
-    """Return (T,) with which visits sum to last minus first, or to the slope of a line by time."""
+    """Return weights (T,) with which visits sum to last minus first, or to the slope of a line by time."""
     if rate:
         times = np.array([visit.time for visit in visits])
         away = times - times.mean()
@@ -104,7 +104,7 @@ def contrast(visits: Sequence[Visit], *, rate: bool) -> FloatArray:
 
 
 def noise_factor(visits: Sequence[Visit], weights: FloatArray) -> float:
-    """Return by how much the noise of one scan counts in the sum of visits by `weights` (T,), each a mean of scans."""
+    """Return the factor of the noise of one scan in the sum of visits by `weights` (T,), each a mean of scans."""
     return float(np.sqrt(sum(w**2 / len(visit.rows) for w, visit in zip(weights, visits, strict=True))))
 
 
@@ -113,9 +113,9 @@ class ChangeUncertainty:
     """Standard deviations of a sum over visits of one subject.
 
     Args:
-        along_mm: (V,) along the normals.
-        landmarks_mm: (L,) of the whole displacement of each landmark: root of the summed variances along the axes.
-        volumes_mm3: (P,) of the volume swept by each part; NaN where nothing is known of it.
+        along_mm: (V,) standard deviation along the normals.
+        landmarks_mm: (L,) standard deviation of each landmark: root of the summed variances along the axes.
+        volumes_mm3: (P,) standard deviation of the volume swept by each part; NaN if not known.
     """
 
     along_mm: FloatArray
@@ -126,7 +126,7 @@ class ChangeUncertainty:
 def uncertainty_from_stable_part(
     subject: AlignedVisits, landmarks: SurfaceLandmarks, parts: FloatArray
 ) -> ChangeUncertainty:
-    """Return what the spread over the stable part says, which did not change; the same at all vertices."""
+    """Return standard deviations by the spread over the stable part, which did not change; equal at all vertices."""
     moved = subject.means[-1] - subject.means[0]
     along = np.einsum("vd,vd->v", moved, subject.normals)
     spread_mm = _spread(along, subject.weights)
@@ -137,18 +137,18 @@ def uncertainty_from_stable_part(
 def uncertainty_from_fits(
     cohort: Cohort, subject: AlignedVisits, weights: FloatArray, landmarks: SurfaceLandmarks, parts: FloatArray
 ) -> ChangeUncertainty:
-    """Return what the fits' own standard deviations say, through modes and alignment.
+    """Return standard deviations from those stated by the fits, through modes and alignment.
 
-    Coefficients vary by `b_stddev`, modes move the vertices, and the alignment takes out what of that is a rigid motion
-    of the stable part. Where displacements there, which should be none, are larger than that, all is widened by the
-    same factor.
+    Coefficients vary by `b_stddev`, modes move the vertices, and the alignment removes the rigid motion of the stable
+    part from their displacements. If the observed displacements of the stable part exceed these standard deviations,
+    all standard deviations are multiplied by the same factor.
 
     Args:
-        cohort: of fits.
-        subject: aligned.
-        weights: (T,) of the sum over visits.
-        landmarks: on the surfaces.
-        parts: (P, V) of which volumes are swept, 1 for their vertices and 0 for the others.
+        cohort: cohort of fits.
+        subject: aligned visits of the subject.
+        weights: (T,) weights of the sum over visits.
+        landmarks: landmarks on the surfaces.
+        parts: (P, V) parts with volumes, 1 for their vertices and 0 for the others.
     """
     fitted, faces = cohort.fitted, faces_in(cohort)
     assert fitted is not None

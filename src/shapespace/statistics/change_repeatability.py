@@ -13,7 +13,7 @@ from shapespace.statistics.change_maps import AlignedVisits, swept_mm3
 from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks
 
 SMALLEST = 1.96 * float(np.sqrt(2.0))
-"""Of the within-subject standard deviation: the smallest detectable change of one scan against another."""
+"""Factor from the within-subject standard deviation to the smallest detectable change between two scans."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -25,11 +25,11 @@ class Repeatability:
         visits: number of visits with rescans.
         freedom: degrees of freedom, scans less visits.
         within_mm: (V,) within-subject standard deviation along the normals.
-        volumes_within_mm3: (P,) of the volume that each part sweeps, the whole first.
-        landmarks_within_mm: (L,) of each landmark: root of the summed variances along the axes.
+        volumes_within_mm3: (P,) standard deviation of the volume that each part sweeps, the complete surface first.
+        landmarks_within_mm: (L,) standard deviation of each landmark: root of the summed variances along the axes.
         icc: (V,) intraclass correlation of each vertex between people, all three axes; NaN without two people.
-        shape_icc: of all vertices together.
-        volume_icc: of the volume between the surface and the mean.
+        shape_icc: intraclass correlation of all vertices together.
+        volume_icc: intraclass correlation of the volume between the surface and the mean.
     """
 
     scans: int
@@ -51,12 +51,12 @@ class Repeatability:
 
     @property
     def volumes_smallest_mm3(self) -> FloatArray:
-        """(P,) the same of the volumes."""
+        """(P,) smallest detectable change of the volumes."""
         return SMALLEST * self.volumes_within_mm3
 
     @property
     def landmarks_smallest_mm(self) -> FloatArray:
-        """(L,) the same of each landmark."""
+        """(L,) smallest detectable change of each landmark."""
         return SMALLEST * self.landmarks_within_mm
 
 
@@ -65,10 +65,10 @@ class RepeatabilityEstimator:
     """Estimator of repeatability that takes one subject at a time.
 
     Args:
-        reference: (V, 3) in whose frame people are compared.
-        faces: (F, 3).
-        landmarks: on the surfaces.
-        parts: (P, V) of which volumes are swept, the whole first; 1 for their vertices and 0 for the others.
+        reference: (V, 3) surface in whose frame people are compared.
+        faces: (F, 3) triangles.
+        landmarks: landmarks on the surfaces.
+        parts: (P, V) parts with volumes, the complete surface first; 1 for their vertices and 0 for the others.
     """
 
     reference: FloatArray

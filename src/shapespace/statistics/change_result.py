@@ -24,7 +24,7 @@ from shapespace.statistics.methods import AnalysisResult, dispersion_record, met
 from shapespace.types import BoolArray, FloatArray, Mesh, SurfaceLandmarks
 
 NINETY_FIVE = 1.96
-"""Standard deviations that noise exceeds one time in twenty."""
+"""Standard deviations that noise alone exceeds in 5 % of the cases."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,17 +35,18 @@ class ChangeConfig:
         subject: column of the subjects.
         time: column of the times: numbers, dates (2026-05-31) or words (default: time, visit or date).
         order: order of times that are words, the earliest first, such as before,after.
-        stable: the part that did not change, by which visits are aligned: `auto` (detected), `all`, a region of the
-            model, a file of vertices, or `landmarks:NAME,NAME,MM`, the vertices within MM of these; in Python also the
-            vertices.
-        regions: name -> vertices, whose volumes are reported in addition to the total; None takes those of the model.
+        stable: part that did not change, by which visits are aligned: `auto` (detected), `all`, a region of the model,
+            a file of vertices, or `landmarks:NAME,NAME,MM`, the vertices within MM of these landmarks; in Python also
+            the vertices.
+        regions: name -> vertices, whose volumes are reported in addition to the total; None for the regions of the
+            model.
         group: column of two groups whose changes are compared.
-        rate: analyse mm per unit of time instead of last minus first visit.
+        rate: whether to analyse mm per unit of time instead of last minus first visit.
         permutations: number of permutations.
         seed: seed of the permutations.
-        variances: of the groups: `equal` permutes subjects, `unequal` computes Welch's t and flips signs, `auto` uses
-            `unequal` if groups may differ in dispersion: p of its test is at most 0.3, or 0.05 for groups of the same
-            size.
+        variances: assumption on the variances of the groups: `equal` permutes subjects, `unequal` computes Welch's t
+            and flips signs, `auto` uses `unequal` if groups may differ in dispersion: p of its test is at most 0.3, or
+            0.05 for groups of the same size.
         drop_missing: exclude shapes with missing values in the table (default: an error).
     """
 
@@ -64,14 +65,14 @@ class ChangeConfig:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class VisitChange:
-    """One visit beside the first of its subject.
+    """A visit compared with the first visit of its subject.
 
     Args:
-        label: the time as the table tells it.
-        time: the same as a number.
-        scans: of it.
+        label: time as written in the table.
+        time: time as a number.
+        scans: number of scans of the visit.
         rms_mm: RMS over the surface of the displacement along the normals.
-        volume_mm3: swept since the first visit.
+        volume_mm3: volume swept since the first visit.
     """
 
     label: str
@@ -89,12 +90,12 @@ class ChangeEstimate:
 
     Args:
         along_mm: (V,) displacement along the normals of the first visit, outwards positive; mm, or mm per unit of time.
-        stddev_mm: (V,) of it.
+        stddev_mm: (V,) standard deviation of `along_mm`.
         landmarks_mm: (L, 3) displacement of each landmark in the frame of the cohort.
-        landmarks_stddev_mm: (L,) of each: root of the summed variances along the axes.
-        volumes_mm3: (P,) volumes swept by the whole and by each region.
-        volumes_stddev_mm3: (P,) of these; NaN where nothing is known of them.
-        quantile: standard deviations that noise exceeds one time in twenty: 1.96, and more where few rescans tell them.
+        landmarks_stddev_mm: (L,) standard deviation of each landmark: root of the summed variances along the axes.
+        volumes_mm3: (P,) volumes swept by the complete surface and by each region.
+        volumes_stddev_mm3: (P,) standard deviation of each volume; NaN if not known.
+        quantile: number of standard deviations that noise exceeds in 5 % of the cases: 1.96, and more with few rescans.
     """
 
     along_mm: FloatArray
@@ -109,23 +110,23 @@ class ChangeEstimate:
 
     @property
     def beyond(self) -> BoolArray:
-        """(V,) where it exceeds what noise alone exceeds one time in twenty."""
+        """(V,) whether the change exceeds the value that noise alone exceeds in 5 % of the cases."""
         return np.abs(self.along_mm) > self.quantile * self.stddev_mm
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SubjectChange:
-    """What changed in one subject.
+    """Changes of one subject between visits.
 
     Args:
-        name: of the subject.
-        group: that it is in; empty where none was asked for.
-        visits: in order, the first among them.
+        name: name of the subject.
+        group: group of the subject; empty without groups.
+        visits: visits in order, the first among them.
         change: last visit minus first.
-        rate: slope of a line through all visits by least squares, per unit of time; None where times are words.
-        stable: (V,) bool, what carried the alignment of the last scan.
-        area_mm2: (V,) of each vertex at the first visit.
-        volume_before_mm3: volume at the first visit; NaN of a surface that is not closed.
+        rate: slope of a line through all visits by least squares, per unit of time; None if times are words.
+        stable: (V,) bool, vertices by which the last scan is aligned.
+        area_mm2: (V,) area of each vertex at the first visit.
+        volume_before_mm3: volume at the first visit; NaN for a surface that is not closed.
         observed: (V,) bool, whether all scans of the subject observe a vertex; None if they observe all. Elsewhere the
             change is between estimates, and does not count in `rms_mm` and `beyond_share`.
     """
@@ -142,7 +143,7 @@ class SubjectChange:
 
     @property
     def observed_area_mm2(self) -> FloatArray:
-        """(V,) `area_mm2`, 0 where a vertex is an estimate."""
+        """(V,) `area_mm2`, or 0 if a vertex is an estimate."""
         return self.area_mm2 if self.observed is None else self.area_mm2 * self.observed
 
     @property
@@ -159,7 +160,7 @@ class SubjectChange:
 
     @property
     def beyond_share(self) -> float:
-        """Share of the surface whose change exceeds its uncertainty; noise alone gives 0.05."""
+        """Share of the surface whose change exceeds its uncertainty; 0.05 on average for noise alone."""
         return float(np.average(self.change.beyond, weights=self.observed_area_mm2))
 
 
@@ -168,9 +169,9 @@ class MeanChangeTests:
     """Tests of the mean change over subjects.
 
     Args:
-        surface: at the vertices, along the normals.
-        volumes: of the regions.
-        landmarks: along the normals; None without landmarks.
+        surface: tests at the vertices, along the normals.
+        volumes: tests of the volumes of the regions.
+        landmarks: tests of the landmarks along the normals; None without landmarks.
     """
 
     surface: MapTest
@@ -185,10 +186,10 @@ class GroupDifferenceTests:
     """Tests of the difference between the changes of two groups.
 
     Args:
-        groups: their names, in order; differences are of the second minus the first.
-        surface: at the vertices, along the normals.
-        volumes: of the regions.
-        dispersion: test of equal dispersion of the changes; None where it cannot be tested.
+        groups: names of the groups, in order; differences are of the second minus the first.
+        surface: tests at the vertices, along the normals.
+        volumes: tests of the volumes of the regions.
+        dispersion: test of equal dispersion of the changes; None if it cannot be tested.
     """
 
     groups: tuple[str, str]
@@ -204,20 +205,20 @@ class ChangeResult(AnalysisResult):
     """Changes of the subjects of a cohort between their visits, and tests over subjects.
 
     Args:
-        cohort: it is of.
+        cohort: cohort of the analysis.
         config: options of the analysis.
-        subjects: with two visits or more, in the order of the table.
+        subjects: changes of the subjects with two visits or more, in the order of the table.
         single_visit_subjects: subjects with one visit, who are excluded.
-        uncertainty: where standard deviations come from: `rescans`; `fits`, their own; `stable`, the spread over what
-            is stable.
-        repeatability: from rescans; None without.
+        uncertainty: source of the standard deviations: `rescans`; `fits`, their own standard deviations; `stable`, the
+            spread over the stable part.
+        repeatability: repeatability from rescans; None without rescans.
         mean_change: tests of the mean over subjects; None for a single subject.
         group_difference: tests of the difference of two groups; None without `ChangeConfig.group`.
-        before: (V, 3) mean of the first visits,
-        after: and moved by the mean change.
-        landmarks: on the surfaces.
-        regions: names of the parts with volumes: `whole` and the regions.
-        time_unit: as in `mm per year`; empty where times are words.
+        before: (V, 3) mean of the first visits, mm.
+        after: (V, 3) the mean of the first visits moved by the mean change, mm.
+        landmarks: landmarks on the surfaces.
+        regions: names of the parts with volumes: first the complete surface, then the regions.
+        time_unit: unit of time for rates, such as `year`; empty if times are words.
         is_closed: whether the surface is closed.
         is_model_only: whether the surfaces contain only variation of the model of the fits.
         blank: (V,) bool, where maps are blank because too few subjects observe the vertex; None if nowhere.
@@ -265,8 +266,8 @@ class ChangeResult(AnalysisResult):
                         exhaustive=test.every, unequal_variances=test.unequal_variances,
                     )
                 )  # fmt: skip
-        names = [one.name for one in self.subjects for visit in one.visits for _ in range(visit.scans)]
-        group = {one.name: one.group for one in self.subjects}
+        names = [subject.name for subject in self.subjects for visit in subject.visits for _ in range(visit.scans)]
+        group = {subject.name: subject.group for subject in self.subjects}
         variables = [(self.config.group, [group[name] for name in names])] if self.config.group else []
         return methods_of(
             self.cohort, len(self.subjects), shapes=len(names), dimensions=None, tests=tuple(tests),

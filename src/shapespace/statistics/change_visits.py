@@ -1,4 +1,4 @@
-"""Visits of subjects from a table: who was scanned when, in which order, and which scans repeat another."""
+"""Visits of subjects from a table: the scans of each subject in order of time, and which scans repeat another."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from shapespace.errors import InputError
 from shapespace.reprs import short_repr
 
 TIMES = ("time", "visit", "date")
-"""The columns that may tell the time; the first that is there does."""
+"""Columns that may contain the time; the first that exists is used."""
 RESCAN = "rescan"
 _NOT_MARKED = frozenset({"", "0", "0.0", "no", "false"})
 _DAYS_IN_A_YEAR = 365.25  # days; mean of the Julian calendar
@@ -19,12 +19,12 @@ _DAYS_IN_A_YEAR = 365.25  # days; mean of the Julian calendar
 
 @dataclass(frozen=True)
 class Visit:
-    """One time of one subject.
+    """A visit: all scans of one subject at one time.
 
     Args:
-        time: in units of `Visits.time_unit`, or the place in the order of words.
-        label: as the table tells it.
-        rows: of its scans; more than one are rescans.
+        time: time in the unit of `Visits.time_unit`, or the position in the order of words.
+        label: time as written in the table.
+        rows: rows of its scans; more than one are rescans.
     """
 
     time: float
@@ -38,8 +38,8 @@ class Visits:
 
     Args:
         by_subject: subject -> visits, in order.
-        time_unit: such as "year", for rates; empty where times are words.
-        column: that tells the times.
+        time_unit: unit of time for rates, such as "year"; empty if times are words.
+        column: column of the times.
     """
 
     by_subject: Mapping[str, tuple[Visit, ...]]
@@ -50,22 +50,22 @@ class Visits:
 
     @property
     def rescans(self) -> int:
-        """Scans beside the first of their visit."""
+        """Number of scans in addition to the first of their visit."""
         return sum(len(visit.rows) - 1 for visits in self.by_subject.values() for visit in visits)
 
 
 def visits_of(table: Table, subject: str, time: str | None, order: Sequence[str] | None) -> Visits:
-    """Return the visits in a table of which no subject and no time is missing.
+    """Return the visits in a table without missing subjects and times.
 
     Args:
-        table: a row for each scan.
-        subject: the column that tells whose it is.
-        time: the column that tells when; None takes the first of `TIMES` that is there.
-        order: of times that are words, the earliest first; None for numbers and dates.
+        table: table with a row for each scan.
+        subject: column of the subjects.
+        time: column of the times; None for the first column of `TIMES` that exists.
+        order: order of times that are words, the earliest first; None for numbers and dates.
 
     Raises:
         InputError: no such column, times that are neither numbers nor dates without an order, a time that is not in
-            it, or two scans of one visit of which the column `rescan` marks none.
+            the order, or two scans of one visit that the column `rescan` does not mark.
     """
     column = time_column(table, time)
     places, unit = _places(table, column, order)
@@ -92,10 +92,10 @@ def visits_of(table: Table, subject: str, time: str | None, order: Sequence[str]
 
 
 def time_column(table: Table, time: str | None) -> str:
-    """Return the column that tells the time.
+    """Return the column of the times.
 
     Raises:
-        InputError: none of `TIMES` is there, and none was named.
+        InputError: the table has no column of `TIMES`, and none was named.
     """
     if time is not None:
         return time
@@ -118,7 +118,7 @@ def _places(table: Table, column: str, order: Sequence[str] | None) -> tuple[lis
         if odd is not None:
             raise InputError(
                 f"{table.where}: {column!r} is {cells[odd][:40]!r} at {table.rows[odd]}, which is not in the order "
-                f"{','.join(order)}; add it, or leave out the row."
+                f"{','.join(order)}; add it, or exclude the row."
             )
         return [known[cell] for cell in cells], ""
     days = [_day(cell) for cell in cells]
@@ -126,15 +126,15 @@ def _places(table: Table, column: str, order: Sequence[str] | None) -> tuple[lis
         odd = next((row for row, day in enumerate(days) if day is None), None)
         if odd is not None:
             raise InputError(
-                f"{table.where}: {column!r} holds dates but {cells[odd][:40]!r} at {table.rows[odd]}; write it as "
+                f"{table.where}: {column!r} contains dates but {cells[odd][:40]!r} at {table.rows[odd]}; write it as "
                 "2026-05-31."
             )
         return [day / _DAYS_IN_A_YEAR for day in days if day is not None], "year"
     if table.kind(column) == "text":
         words = list(dict.fromkeys(cells))
         raise InputError(
-            f"{table.where}: {column!r} holds words ({list_names(words)}), which have no order of their own; give it, "
-            "the earliest first, as with --order before,after."
+            f"{table.where}: {column!r} contains words ({list_names(words)}), which have no order of their own; "
+            "specify it, the earliest first, as with --order before,after."
         )
     return [float(value) for value in table.numbers(column)], f"unit of {column}"
 

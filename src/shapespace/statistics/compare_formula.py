@@ -1,7 +1,7 @@
-"""A formula such as `~ sex + age` to the columns of a linear model: its terms, and contrasts between values.
+"""Columns of a linear model from a formula such as `~ sex + age`: its terms, and contrasts between values.
 
-Only names of columns and a few functions may stand in a formula, so it runs nothing but what it says. Columns and
-coding are formulaic's; classes are coded by deviations (sum to zero), so that type III tests mean something.
+A formula may contain only names of columns and a few functions, so that it cannot run other code. Columns and coding
+are those of formulaic; classes are coded by deviations (sum to zero), so that type III tests are meaningful.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from shapespace.types import FloatArray, read_only
 
 INSTALL = "'shapespace[statistics]'"
 FUNCTIONS: Mapping[str, str] = {
-    "C": "classes, where a column holds their numbers",
+    "C": "classes, if the values of a column are their numbers",
     "log": "natural logarithm",
     "log10": "decimal logarithm",
     "sqrt": "square root",
@@ -34,7 +34,7 @@ FUNCTIONS: Mapping[str, str] = {
     "bs": "B-spline, bs(age, df=4)",
     "cr": "natural cubic spline, cr(age, df=2)",
 }
-"""What a formula may call, and what it is."""
+"""Functions that a formula may call, with their description."""
 
 # characters, stars, names and constants that bound the time a formula takes to expand
 _LONGEST, _MOST_STARS, _MOST_NAMES, _LARGEST_CONSTANT = 1000, 5, 64, 20
@@ -49,7 +49,7 @@ _TOKEN = re.compile(r"\s*(`[^`]*`|[\w.]+|\*\*|[-+*:/^()])")
 _PLAIN = re.compile(r"""[\w\s+\-*:/^().,~="']*""")
 _QUOTED = re.compile(r"`([^`]*)`")
 _POWER = re.compile(r"\*\*|\^")
-_ALLOWED = f"columns and {', '.join(FUNCTIONS)} are all that may stand there."
+_ALLOWED = f"a formula may contain only columns and {', '.join(FUNCTIONS)}."
 _CONTEXT = {"sqrt": np.sqrt}
 Coding: TypeAlias = Literal["deviation", "treatment"]
 """Coding of classes: deviations from their mean, or differences from the first class."""
@@ -61,13 +61,13 @@ class Variable:
     """A column that a formula names, as numbers or as classes.
 
     Args:
-        name: of the column; in C() where its numbers are taken for classes.
-        column: its name inside.
-        levels: classes in order; none of numbers.
+        name: name of the column; in C() if its numbers denote classes.
+        column: internal name of the column.
+        levels: classes in order; empty for numbers.
         groups: classes whose sizes and dispersion count: the levels, or both values of numbers that have only two.
         low: 5th percentile of numbers; the smaller of two values.
-        high: 95th percentile; the larger of two values.
-        middle: their mean.
+        high: 95th percentile of numbers; the larger of two values.
+        middle: mean of numbers.
     """
 
     name: str
@@ -88,10 +88,10 @@ class Term:
     """A term of a formula.
 
     Args:
-        label: as it is called.
-        factors: what is multiplied in it, as written.
-        variables: of them, by their names inside.
-        columns: of the design.
+        label: name of the term.
+        factors: factors that the term multiplies, as written.
+        variables: internal names of the variables in these factors.
+        columns: columns of the design that belong to the term.
     """
 
     label: str
@@ -102,15 +102,15 @@ class Term:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Design:
-    """The columns of a linear model beside the intercept.
+    """The columns of a linear model, except the intercept.
 
     Args:
-        formula: as it was given.
-        matrix: (N, p).
-        terms: of it, those of fewer variables first.
-        variables: that it names.
-        values: N of each variable, by its name inside.
-        factors: the variable, by its name inside, of each factor of the terms, in the order of the formula.
+        formula: formula as passed.
+        matrix: (N, p) columns of the model.
+        terms: terms of the formula, those of fewer variables first.
+        variables: variables that the formula names.
+        values: internal name of each variable -> its N values.
+        factors: factor of the terms -> internal name of its variable, in the order of the formula.
     """
 
     formula: str
@@ -129,7 +129,7 @@ class Design:
     __repr__ = short_repr
 
     def rows(self, values: Mapping[str, Sequence[str | float]]) -> FloatArray:
-        """Return the (n, p) columns where each variable, by its name inside, has these n values."""
+        """Return the (n, p) columns for n given values of each variable, by its internal name."""
         made = self._spec.get_model_matrix(self._frame(values), context=_CONTEXT)
         return np.asarray(made, dtype=np.float64)[:, self._skipped :]
 
@@ -137,7 +137,7 @@ class Design:
         """Return the columns of other products of the same factors, for the same rows.
 
         Args:
-            products: factors of each, as in `Term.factors`; the empty product is the constant and comes first.
+            products: factors of each product, as in `Term.factors`; the empty product is the constant and comes first.
         """
         key = tuple(products)
         if key in self._parts:
@@ -152,7 +152,9 @@ class Design:
         spec = made.model_spec
         slices = [tuple(int(column) for column in indices) for indices in spec.term_indices.values()]
         terms = tuple(
-            Term(":".join(product) or "1", frozenset(product), frozenset(self.factors[one] for one in product), own)
+            Term(
+                ":".join(product) or "1", frozenset(product), frozenset(self.factors[factor] for factor in product), own
+            )
             for product, own in zip(ordered, slices, strict=True)
         )
         matrix = read_only(np.asarray(made, dtype=np.float64))
@@ -163,45 +165,47 @@ class Design:
     def _frame(self, values: Mapping[str, Sequence[str | float]]) -> Any:
         pandas = require_package("pandas", "A formula", INSTALL)
         frame: dict[str, Any] = {}
-        for one in self.variables:
-            own = list(values[one.column])
-            frame[one.column] = pandas.Categorical(own, categories=one.levels) if one.levels else own
+        for variable in self.variables:
+            own = list(values[variable.column])
+            frame[variable.column] = pandas.Categorical(own, categories=variable.levels) if variable.levels else own
         return pandas.DataFrame(frame)
 
-    def groups_of(self, one: Variable) -> list[str]:
+    def groups_of(self, variable: Variable) -> list[str]:
         """Return the group of each row by a variable that has groups."""
-        values = self.values[one.column]
-        return [str(value) for value in values] if one.levels else [_group(float(value)) for value in values]
+        values = self.values[variable.column]
+        return [str(value) for value in values] if variable.levels else [_group_label(float(value)) for value in values]
 
     def average(self, fixed: Mapping[str, str | float], averaged: frozenset[str] | None = None) -> FloatArray:
         """Return the (p,) columns, averaged over the classes of variables in the terms, with numbers at their mean.
 
         Args:
-            fixed: values of variables that are not averaged, by their names inside.
+            fixed: values of variables that are not averaged, by their internal names.
             averaged: variables whose classes are averaged; None for those of all terms.
         """
         used = {name for term in self.terms for name in term.variables} if averaged is None else averaged
         choices: list[Sequence[str | float]] = []
-        for one in self.variables:
-            own = one.levels if one.column in used else one.levels[:1]
-            choices.append((fixed[one.column],) if one.column in fixed else own or (one.middle,))
+        for variable in self.variables:
+            own = variable.levels if variable.column in used else variable.levels[:1]
+            choices.append((fixed[variable.column],) if variable.column in fixed else own or (variable.middle,))
         cells = _cells(choices, self.formula)
         return read_only(
-            self.rows({one.column: [cell[k] for cell in cells] for k, one in enumerate(self.variables)}).mean(axis=0)
+            self.rows({variable.column: [cell[k] for cell in cells] for k, variable in enumerate(self.variables)}).mean(
+                axis=0
+            )
         )
 
     def contrast(
         self, column: str, low: str | float, high: str | float, fixed: Mapping[str, str | float] | None = None
     ) -> FloatArray:
-        """Return what `high` has more than `low` in each of the p columns, on an average of the other variables.
+        """Return the difference of each of the p columns between `high` and `low`, averaged over the other variables.
 
-        Classes of the others count alike, numbers stand at their mean; only others that share a term matter.
+        All classes of the others have the same weight, numbers are at their mean; only others that share a term matter.
 
         Args:
-            column: of the variable, by its name inside.
-            low: value.
-            high: value.
-            fixed: values of other variables, by their names inside.
+            column: internal name of the variable.
+            low: value from which it changes.
+            high: value to which it changes.
+            fixed: values of other variables, by their internal names.
         """
         interacting = frozenset(name for term in self.terms if column in term.variables for name in term.variables)
         at_low, at_high = (self.average({**(fixed or {}), column: value}, interacting) for value in (low, high))
@@ -210,25 +214,25 @@ class Design:
 
 def _cells(choices: Sequence[Sequence[str | float]], formula: str) -> list[tuple[str | float, ...]]:
     if np.prod([float(len(choice)) for choice in choices]) > _MOST_CELLS:
-        raise InputError(f"The classes in {formula!r} make too many combinations; leave out interactions.")
+        raise InputError(f"The classes in {formula!r} make too many combinations; remove interactions.")
     return list(itertools.product(*choices))
 
 
 def columns_of(formula: str, table: Table) -> dict[str, set[str]]:
-    """Return the columns of the table that a formula names, and the functions of each; "" for the column itself.
+    """Return the columns of the table that a formula names, with the functions of each; "" for the column itself.
 
     Raises:
-        InputError: it cannot be read, or names something else.
+        InputError: the formula cannot be read, or names something else.
         ShapespaceError: the extra `statistics` is not installed.
     """
     calls: dict[str, set[str]] = {}
-    for factor in itertools.chain.from_iterable(_parsed(formula, table)):
+    for factor in itertools.chain.from_iterable(_parse_terms(formula, table)):
         calls.setdefault(factor.name, set()).add(factor.call)
     return calls
 
 
 def quoted(column: str) -> str:
-    """Return the name of a column as it is written in a formula, in backticks where it needs them."""
+    """Return the name of a column as it is written in a formula, in backticks if it needs them."""
     return column if column.isidentifier() else f"`{column}`"
 
 
@@ -237,10 +241,10 @@ def random_effects_of(random: str, table: Table) -> tuple[tuple[frozenset[str], 
 
     Args:
         random: random terms such as `1 + time | subject`; they must contain the 1, the mean of each subject.
-        table: with the columns that the terms name.
+        table: table with the columns that the terms name.
 
     Raises:
-        InputError: it cannot be read, leaves out the 1, or names something that is no column.
+        InputError: the random terms cannot be read, omit the 1, or name something that is no column.
         ShapespaceError: the extra `statistics` is not installed.
     """
     inner = random.strip()
@@ -258,23 +262,23 @@ def random_effects_of(random: str, table: Table) -> tuple[tuple[frozenset[str], 
         )
     if effects == "1":
         return (), column
-    return tuple(frozenset(factor.text for factor in term) for term in _parsed(effects, table)), column
+    return tuple(frozenset(factor.text for factor in term) for term in _parse_terms(effects, table)), column
 
 
 def design_of(formula: str, table: Table, coding: Coding = "deviation") -> Design:
-    """Return the columns of a linear model of the rows of a table, in which nothing that is named is missing.
+    """Return the columns of a linear model of the rows of a table, whose named columns have no missing values.
 
     Args:
-        formula: of the model.
-        table: with the columns that it names.
-        coding: of classes.
+        formula: formula of the model.
+        table: table with the columns that the formula names.
+        coding: coding of classes.
 
     Raises:
         InputError: the formula cannot be read, names something that is no column or calls something that is not in
-            `FUNCTIONS`; a column is the same for all, holds text where numbers should be, or gives no finite number.
+            `FUNCTIONS`; a column is constant, contains text where numbers are needed, or yields no finite number.
         ShapespaceError: the extra `statistics` is not installed.
     """
-    parsed = _parsed(formula, table)
+    parsed = _parse_terms(formula, table)
     pandas = require_package("pandas", "A formula", INSTALL)
     formulaic = require_package("formulaic", "A formula", INSTALL)
     inside: dict[tuple[str, bool], Variable] = {}
@@ -283,7 +287,7 @@ def design_of(formula: str, table: Table, coding: Coding = "deviation") -> Desig
     for factor in itertools.chain.from_iterable(parsed):
         classes = factor.holds_classes(table)
         if (factor.name, classes) not in inside:
-            variable, values = _variable(table, factor.name, f"v{len(inside)}", classes=classes)
+            variable, values = _make_variable(table, factor.name, f"v{len(inside)}", classes=classes)
             inside[factor.name, classes] = variable
             own_values[variable.column] = values
             frame[variable.column] = (
@@ -294,21 +298,21 @@ def design_of(formula: str, table: Table, coding: Coding = "deviation") -> Desig
     factors, members = list[frozenset[str]](), list[frozenset[str]]()
     for term in parsed:
         own = [inside[factor.name, factor.holds_classes(table)] for factor in term]
-        for factor, one in zip(term, own, strict=True):
-            variable_of[factor.text] = one.column
-            codes[factor.text] = factor.written(one.column, coding, classes=bool(one.levels))
+        for factor, variable in zip(term, own, strict=True):
+            variable_of[factor.text] = variable.column
+            codes[factor.text] = factor.written(variable.column, coding, classes=bool(variable.levels))
         written.append(":".join(codes[factor.text] for factor in term))
         labels.append(":".join(factor.text for factor in term))
         factors.append(frozenset(factor.text for factor in term))
-        members.append(frozenset(one.column for one in own))
+        members.append(frozenset(variable.column for variable in own))
     try:
         with np.errstate(all="ignore"):
             made = formulaic.Formula(written, _ordering="none").get_model_matrix(
                 pandas.DataFrame(frame), context=_CONTEXT, na_action="ignore"
             )
-    # formulaic hands on whatever the functions of a formula raise.
+    # formulaic passes on any exception of the functions in a formula.
     except Exception as error:
-        raise InputError(f"The formula {formula!r} cannot be worked out ({_first(error)}); correct it.") from error
+        raise InputError(f"The formula {formula!r} cannot be worked out ({_first_line(error)}); correct it.") from error
     matrix = np.asarray(made, dtype=np.float64)
     spec = made.model_spec
     slices = [tuple(int(index) - 1 for index in indices) for indices in spec.term_indices.values()][1:]
@@ -330,13 +334,13 @@ def design_of(formula: str, table: Table, coding: Coding = "deviation") -> Desig
 
 @dataclass(frozen=True)
 class _Factor:
-    """A piece of a term: a column, or what a function makes of it.
+    """A factor of a term: a column, or a function of a column.
 
     Args:
-        text: as it was written.
-        name: of the column.
-        call: the function; empty for none.
-        tree: the call; None for none.
+        text: factor as written.
+        name: name of the column.
+        call: name of the function; empty if there is none.
+        tree: parsed call of the function; None if there is none.
     """
 
     text: str
@@ -345,35 +349,35 @@ class _Factor:
     tree: ast.expr | None = None
 
     def holds_classes(self, table: Table) -> bool:
-        """Return whether it is classes, not numbers.
+        """Return whether the factor is classes, not numbers.
 
         Raises:
-            InputError: a function needs numbers and the column holds text.
+            InputError: a function needs numbers and the column contains text.
         """
         text = table.kind(self.name) == "text"
         if text and self.call not in ("", "C"):
             raise InputError(
-                f"{table.where}: {self.call}() in the formula needs numbers, and {self.name!r} holds text."
+                f"{table.where}: {self.call}() in the formula needs numbers, and {self.name!r} contains text."
             )
         return text or self.call == "C"
 
     def written(self, column: str, coding: Coding, *, classes: bool) -> str:
-        """Return it with the column's name inside, which can be no code."""
+        """Return the factor with the column's internal name, which cannot be code."""
         if classes:
             return f"C({column}, {_CONTRASTS[coding]})"
-        return column if self.tree is None else ast.unparse(_renamed(self.tree, column))
+        return column if self.tree is None else ast.unparse(_rename_column(self.tree, column))
 
 
-def _renamed(tree: ast.expr, column: str) -> ast.expr:
+def _rename_column(tree: ast.expr, column: str) -> ast.expr:
     """Return a checked call with `column` for its innermost first argument."""
     if isinstance(tree, ast.Call):
         # Without the constraint the columns of cr() contain the constant.
         centred = [ast.keyword("constraints", ast.Constant("center"))] if ast.unparse(tree.func) == "cr" else []
-        return ast.Call(tree.func, [_renamed(tree.args[0], column), *tree.args[1:]], [*tree.keywords, *centred])
+        return ast.Call(tree.func, [_rename_column(tree.args[0], column), *tree.args[1:]], [*tree.keywords, *centred])
     return ast.Name(column)
 
 
-def _parsed(formula: str, table: Table) -> list[list[_Factor]]:
+def _parse_terms(formula: str, table: Table) -> list[list[_Factor]]:
     formulaic = require_package("formulaic", "A formula", INSTALL)
     where = f"The formula {formula[:80]!r}"
     right = formula.strip().removeprefix("~")
@@ -385,32 +389,30 @@ def _parsed(formula: str, table: Table) -> list[list[_Factor]]:
     unquoted = next((name for name in odd if name in _QUOTED.sub("", right)), None)
     advice = "write one such as '~ sex + age'" if unquoted is None else f"write {quoted(unquoted)} with its backticks"
     if "~" in plain:
-        raise InputError(
-            f"{where} has something before ~ or a second one; shape is what is explained, so write '~ sex'."
-        )
+        raise InputError(f"{where} has something before ~ or a second one; shape is the response, so write '~ sex'.")
     if len(formula) > _LONGEST or stars > _MOST_STARS or powers > 1 or len(re.findall(r"\w+", plain)) > _MOST_NAMES:
         raise InputError(f"{where} is too long; write a shorter one.")
     if not _PLAIN.fullmatch(plain) or re.search(r"(\*\*|\^)(?!\s*[23]\b)", plain):
         raise InputError(
-            f"{where} holds something other than columns, + - * : / ^ and the functions of a formula; {advice}."
+            f"{where} contains something other than columns, + - * : / ^ and the functions of a formula; {advice}."
         )
     columns = _Bound(right, table, where, advice).columns()
     if columns > _MOST_COLUMNS:
         raise InputError(
             f"{where} makes up to {columns if columns < 10**9 else 'billions of'} columns, and {_MOST_COLUMNS} are "
-            "the limit; leave out interactions or classes."
+            "the limit; remove interactions or classes."
         )
     try:
         terms = list(formulaic.Formula("~ " + right, _ordering="degree"))
         keeps_mean = any(str(term) == "1" for term in terms)
-        drawn = [[_factor(f, table, where) for f in term.factors] for term in terms if str(term) != "1"]
+        drawn = [[_parse_factor(f, table, where) for f in term.factors] for term in terms if str(term) != "1"]
     except ShapespaceError:
         raise
-    # The parser raises what it likes on what it cannot read.
+    # The parser may raise any exception for text that it cannot read.
     except Exception as error:
-        raise InputError(f"{where} cannot be read ({_first(error)}); {advice}.") from error
+        raise InputError(f"{where} cannot be read ({_first_line(error)}); {advice}.") from error
     if not keeps_mean:
-        raise InputError(f"{where} leaves out the mean shape, without which effects mean nothing; drop the 0 or - 1.")
+        raise InputError(f"{where} omits the mean shape, without which effects mean nothing; remove the 0 or - 1.")
     if not drawn:
         raise InputError(f"{where} names no column; write one such as '~ sex + age'.")
     return drawn
@@ -456,7 +458,7 @@ class _Bound:
         return InputError(f"{self.where} cannot be read near {near[:20]!r}; {self.advice}.")
 
     def _next(self, *wanted: str) -> str:
-        """Return the next token and go past it if it is one of those wanted, else an empty text."""
+        """Return the next token and go past it if it is one of `wanted`, else return an empty text."""
         token = self.tokens[self.position] if self.position < len(self.tokens) else ""
         if token not in wanted:
             return ""
@@ -523,10 +525,10 @@ class _Bound:
         if depth:
             raise self._unreadable()
         if token in ("poly", "bs", "cr"):
-            columns = max([_SPLINE, *(int(one) for one in inside if one.isdecimal() and len(one) < 3)])
+            columns = max([_SPLINE, *(int(part) for part in inside if part.isdecimal() and len(part) < 3)])
             return _Size(columns, columns)
         return max(
-            (self._size_of(one.strip("`"), classes=token == "C") for one in inside), key=lambda size: size.columns
+            (self._size_of(part.strip("`"), classes=token == "C") for part in inside), key=lambda size: size.columns
         )
 
     def _size_of(self, name: str, *, classes: bool = False) -> _Size:
@@ -536,54 +538,54 @@ class _Bound:
         return _Size(levels, levels)
 
 
-def _factor(factor: Any, table: Table, where: str) -> _Factor:
+def _parse_factor(factor: Any, table: Table, where: str) -> _Factor:
     text, kind = str(factor.expr), factor.eval_method.value
     if kind == "lookup":
-        return _Factor(text, _known(text, table, where))
+        return _Factor(text, _check_column(text, table, where))
     quoted_names: dict[str, str] = {}
 
     plain = _QUOTED.sub(lambda match: quoted_names.setdefault(match[1], f"quoted_{len(quoted_names)}_"), text)
     tree = ast.parse(plain, mode="eval").body if kind == "python" else None
     if tree is None or not isinstance(tree, ast.Call) or not isinstance(tree.func, ast.Name):
-        raise InputError(f"{where} holds {text[:60]!r}; {_ALLOWED}")
+        raise InputError(f"{where} contains {text[:60]!r}; {_ALLOWED}")
     if tree.func.id == "C" and not (len(tree.args) == 1 and isinstance(tree.args[0], ast.Name) and not tree.keywords):
         raise InputError(f"{where}: {text[:60]!r} must take one column and nothing else.")
-    column = _column(tree, where)
+    column = _innermost_column(tree, where)
     name = next((name for name, own in quoted_names.items() if own == column), column)
-    return _Factor(_QUOTED.sub(r"\1", text), _known(name, table, where), tree.func.id, tree)
+    return _Factor(_QUOTED.sub(r"\1", text), _check_column(name, table, where), tree.func.id, tree)
 
 
-def _column(tree: ast.expr, where: str) -> str:
-    """Return the column in calls of `FUNCTIONS`, whose first argument is a column or a call, and others numbers."""
+def _innermost_column(tree: ast.expr, where: str) -> str:
+    """Return the column in nested calls of `FUNCTIONS`; arguments other than the first must be numbers."""
     if isinstance(tree, ast.Name):
         return tree.id
     function = tree.func.id if isinstance(tree, ast.Call) and isinstance(tree.func, ast.Name) else ""
     if not isinstance(tree, ast.Call) or function not in FUNCTIONS or not tree.args:
-        raise InputError(f"{where} holds {ast.unparse(tree)[:60]!r}; {_ALLOWED}")
+        raise InputError(f"{where} contains {ast.unparse(tree)[:60]!r}; {_ALLOWED}")
     for value in (*tree.args[1:], *(keyword.value for keyword in tree.keywords)):
         constant = value.value if isinstance(value, ast.Constant) else None
         if not isinstance(constant, int | float) or not 0 <= constant <= _LARGEST_CONSTANT:
             raise InputError(f"{where} gives {function}() something other than a number up to {_LARGEST_CONSTANT}.")
-    return _column(tree.args[0], where)
+    return _innermost_column(tree.args[0], where)
 
 
-def _known(name: str, table: Table, where: str) -> str:
+def _check_column(name: str, table: Table, where: str) -> str:
     if name not in table.columns:
         raise InputError(f"{where} names {name[:60]!r}, which is no column; there is {', '.join(table.columns)}.")
     return name
 
 
-def _variable(table: Table, name: str, column: str, *, classes: bool) -> tuple[Variable, Sequence[str | float]]:
-    """Return a column as a variable and its values, of which there are two or more."""
+def _make_variable(table: Table, name: str, column: str, *, classes: bool) -> tuple[Variable, Sequence[str | float]]:
+    """Return a column as a variable, and its values, at least two of which differ."""
     if not classes:
         numbers = table.numbers(name)
         if np.ptp(numbers) == 0:
-            raise InputError(f"{table.where}: {name!r} is {numbers[0]:g} for all {len(table)} shapes; leave it out.")
+            raise InputError(f"{table.where}: {name!r} is {numbers[0]:g} for all {len(table)} shapes; remove it.")
         low, high = (float(value) for value in np.percentile(numbers, [5, 95]))
         two = len(set(numbers.tolist())) == 2
         if two or low == high:
             low, high = float(numbers.min()), float(numbers.max())
-        groups = (_group(low), _group(high)) if two else ()
+        groups = (_group_label(low), _group_label(high)) if two else ()
         return Variable(
             name=name, column=column, levels=(), groups=groups, low=low, high=high, middle=float(numbers.mean())
         ), [float(v) for v in numbers]
@@ -597,10 +599,10 @@ def _variable(table: Table, name: str, column: str, *, classes: bool) -> tuple[V
     return Variable(name=f"C({name})" if numeric else name, column=column, levels=levels, groups=levels), cells
 
 
-def _group(value: float) -> str:
+def _group_label(value: float) -> str:
     return f"{value:.15g}"
 
 
-def _first(error: Exception) -> str:
+def _first_line(error: Exception) -> str:
     text = re.sub(r"\x1b\[[0-9;]*m|[⧛⧚]", "", str(error)).strip()
     return (text.splitlines() or [type(error).__name__])[0][:120].rstrip(".")

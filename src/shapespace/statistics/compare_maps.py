@@ -1,7 +1,7 @@
-"""Changes of shape tested at every vertex; the largest F of each arrangement holds the family-wise error.
+"""Changes of shape tested at every vertex; the largest F of each arrangement controls the family-wise error.
 
-A change may also be sought beside how shapes vary anyway: at each vertex a bump of given width along the normals, by
-the matched filter for it in the covariance of the residuals (as in Fisher's linear discriminant; the covariance is
+A change can also be tested relative to the variation between shapes: at each vertex a bump of given width along the
+normals, by its matched filter in the covariance of the residuals (as in Fisher's linear discriminant; the covariance is
 shrunk by Ledoit and Wolf, J. Multivariate Analysis 88, 2004, towards that of the model and the noise of the fits).
 
 Nichols and Holmes, Human Brain Mapping 15, 2001; Benjamini and Hochberg, JRSS B 57(1), 1995.
@@ -29,9 +29,9 @@ _VERTICES = 512  # vertices at a time; with _BYTES it bounds the memory of permu
 _BYTES = 48 * 2**20  # bytes of permuted values at a time
 _NONE = 1e-12  # share of the squares; a residual below is rounding
 _BINS = 6000
-"""Of the logarithm of F, from a millionth to a million."""
+"""Number of bins of the logarithm of F, from a millionth to a million."""
 _REACH = 2.5
-"""Standard deviations after which a bump ends."""
+"""Number of standard deviations after which a bump ends."""
 _FLOOR = 1e-6  # share of the mean variance that the error variance is at least, so that the matrix is invertible
 
 
@@ -40,14 +40,14 @@ class Tested:
     """A statistic at each vertex.
 
     Args:
-        f: (V,) squared change by its variance.
-        p: (V,) share of arrangements with an F as large there.
+        f: (V,) squared change divided by its variance.
+        p: (V,) share of arrangements with an F as large at the vertex.
         p_family: (V,) share of arrangements whose largest F of all vertices is as large: with `p_family` below 5 % a
-            whole map without any effect shows a vertex in 5 % of studies.
+            map without any effect shows a vertex in 5 % of studies.
         critical: F above which `p_family` is at most the level of the intervals: the change ± its length times
-            sqrt(critical / f) is an interval that holds for all vertices at once.
-        q: (V,) false discovery rate at which the vertex is found; of shares among all vertices of all arrangements,
-            where F is spread alike without an effect, since those of one vertex end at 1 in as many as there are.
+            sqrt(critical / f) is an interval that is simultaneous over all vertices.
+        q: (V,) false discovery rate at which the vertex is found, from the F of all vertices in all arrangements, which
+            have the same distribution without an effect; p of a single vertex has too few different values.
     """
 
     f: FloatArray
@@ -64,12 +64,12 @@ class EffectMap:
     """A change of shape at each vertex.
 
     Args:
-        change_mm: (V, 3).
-        normal_mm: (V,) along the normal of the mean, outwards positive; None for points.
-        length_mm: (V,).
+        change_mm: (V, 3) change, mm.
+        normal_mm: (V,) change along the normal of the mean, outwards positive; None for points.
+        length_mm: (V,) length of the change, mm.
         along: test of `normal_mm`; None for points.
-        any_way: test of `change_mm`, in whatever direction.
-        bump_mm: (V,) height of the bump there that explains the change best; None where none were sought.
+        any_way: test of `change_mm` in any direction.
+        bump_mm: (V,) height of the bump at the vertex that explains the change best; None if none were searched for.
         bump: test of `bump_mm`.
         weight: (V,) factor of F, the share of the information that the observations contain (`information`); 0 where
             the map is blank. None if all vertices are observed.
@@ -92,7 +92,7 @@ class EffectMap:
     __repr__ = short_repr
 
     def interval_mm(self, vertex: int) -> tuple[float, float]:
-        """Return the interval of `shown_mm` at a vertex, which holds for all vertices at once."""
+        """Return the interval of `shown_mm` at a vertex, which is simultaneous over all vertices."""
         f, change = float(self.test.f[vertex]), float(self.shown_mm[vertex])
         half = float("inf") if f <= 0 else abs(change) * float(np.sqrt(self.test.critical / f))  # S9
         # A length is not negative.
@@ -100,7 +100,7 @@ class EffectMap:
 
     @property
     def shown_mm(self) -> FloatArray:
-        """(V,) along the normal where there is one, else the length; 0 where blank."""
+        """(V,) change along the normal if there is one, else the length of the change; 0 where blank."""
         mm = self.length_mm if self.normal_mm is None else self.normal_mm
         return mm if self.blank is None else np.where(self.blank, 0.0, mm)
 
@@ -123,19 +123,20 @@ def effect_maps(
     estimates: Sequence[Estimate] | None = None,
     alpha: float = 0.05,
 ) -> Sequence[EffectMap]:
-    """Return the maps of E effects that are tested beside the same other terms; memory does not grow with P times V.
+    """Return the maps of E effects that share the other terms of the model; memory does not grow with P times V.
 
     Args:
-        cohort: whose vertices they are.
-        stratum: in which they are tested.
-        residual: (n, K) of the other terms.
-        products: (P, m, K) of orthonormal columns of the model with it, in each arrangement; the observed one first.
+        cohort: cohort of the shapes.
+        stratum: stratum in which the effects are tested.
+        residual: (n, K) residuals of the other terms.
+        products: (P, m, K) products of orthonormal columns of the model with the residuals in each arrangement, the
+            observed one first.
         along: (E, m) unit vectors: each effect in these columns.
-        changes: (E, K) mm.
-        bump_width_mm: standard deviation of the bumps; None seeks none.
+        changes: (E, K) changes, mm.
+        bump_width_mm: standard deviation of the bumps; None for no search.
         weights: (E, V) factors of F; None for 1.
-        estimates: E, whose statistics allow unequal variances; None takes the pooled variance of `residual`.
-        alpha: Level of significance, and one minus the confidence of intervals.
+        estimates: E estimates whose statistics allow unequal variances; None for the pooled variance of `residual`.
+        alpha: level of significance, and one minus the confidence of intervals.
     """
     P, m, K = products.shape
     E, V = len(along), cohort.n_vertices
@@ -170,13 +171,13 @@ def effect_maps(
                 as_large[name][:, part] += (f >= observed[name][:, None, part] * (1 - TIE)).sum(axis=1)
                 for e in range(E):
                     counted = f[e] if weights is None else f[e][:, weights[e, part] > 0]
-                    pooled[name][e] += np.bincount(_bin(counted).ravel(), minlength=_BINS)
+                    pooled[name][e] += np.bincount(_bins_of(counted).ravel(), minlength=_BINS)
                 so_far = largest[name][:, start : start + chunk]
                 np.maximum(so_far, f.max(axis=2), out=so_far)
     made: list[EffectMap] = []
     for e in range(E):
         tests = {
-            name: _tested(observed[name][e], as_large[name][e] / P, largest[name][e], pooled[name][e], alpha)
+            name: _make_vertex_test(observed[name][e], as_large[name][e] / P, largest[name][e], pooled[name][e], alpha)
             for name in lenses
         }
         own = {name: read_only(values[e, :, 0]) for name, values in seen.items()}
@@ -197,7 +198,7 @@ def effect_maps(
 
 
 _Lens = Callable[[slice], tuple[FloatArray, FloatArray | float]]
-"""Returns what m vertices see of coefficients: (K, m c) columns, and what of it is 1 mm."""
+"""Function of a slice of m vertices: columns (K, m c) from coefficients to c values per vertex, and values per mm."""
 
 
 def _lenses(cohort: Cohort, residual: FloatArray, bump_width_mm: float | None) -> dict[str, _Lens]:
@@ -224,7 +225,7 @@ def _lenses(cohort: Cohort, residual: FloatArray, bump_width_mm: float | None) -
 
 
 def _bumps(ahead: FloatArray, mean: FloatArray, width_mm: float, precision: FloatArray) -> _Lens:
-    """Return the matched filters of bumps, from what vertices see along their normals (K, V)."""
+    """Return the matched filters of bumps, from the displacements (K, V) of vertices along their normals."""
     from scipy.spatial import cKDTree  # loads much
 
     tree: Any = cKDTree(mean)
@@ -240,7 +241,7 @@ def _bumps(ahead: FloatArray, mean: FloatArray, width_mm: float, precision: Floa
 
 
 def _precision(cohort: Cohort, residual: FloatArray) -> FloatArray:
-    """Return the (K, K) inverse covariance of residuals; no order of them gives another, so tests stay exact."""
+    """Return the (K, K) inverse covariance of residuals; it does not depend on their order, so tests stay exact."""
     sklearn: Any = require_package("sklearn.covariance", "Seeking bumps", INSTALL)
     prior = np.eye(len(cohort.basis))
     if cohort.fitted is not None:
@@ -248,7 +249,7 @@ def _precision(cohort: Cohort, residual: FloatArray) -> FloatArray:
         modes = cohort.fitted.b.shape[1]
         known = cohort.basis @ model.vertex_basis[:, :modes]
         variance = model.stddev[:modes] ** 2 + (cohort.fitted.b_stddev**2).mean(axis=0)
-        # What no mode of the model makes is taken to vary alike in all directions.
+        # Variation outside the modes of the model is assumed to be equal in all directions.
         error_variance = max(float((residual**2).sum() - ((residual @ known) ** 2).sum()), 0.0) / residual.size
         prior = (known * variance) @ known.T + max(error_variance, _FLOOR * float(variance.mean())) * prior
     factor = np.linalg.cholesky(prior)
@@ -258,16 +259,16 @@ def _precision(cohort: Cohort, residual: FloatArray) -> FloatArray:
     return half.T @ np.linalg.solve(shrunk, half)
 
 
-def _bin(f: FloatArray) -> Any:
-    """Return the bins of F, narrow ones of its logarithm."""
+def _bins_of(f: FloatArray) -> Any:
+    """Return the bins of F, narrow bins of its logarithm."""
     return np.clip((np.log10(np.maximum(f, 1e-300)) + 6.0) * (_BINS / 12.0), 0, _BINS - 1).astype(np.intp)
 
 
-def _tested(f: FloatArray, p: FloatArray, largest: FloatArray, pooled: FloatArray, alpha: float) -> Tested:
+def _make_vertex_test(f: FloatArray, p: FloatArray, largest: FloatArray, pooled: FloatArray, alpha: float) -> Tested:
     from scipy.stats import false_discovery_control  # loads much
 
     as_large = len(largest) - np.searchsorted(np.sort(largest), f * (1 - TIE))  # S8
     of_all = np.cumsum(pooled[::-1])[::-1] / pooled.sum()
-    q = false_discovery_control(of_all[_bin(f)])
+    q = false_discovery_control(of_all[_bins_of(f)])
     critical = float(np.sort(largest)[-(int(alpha * len(largest) * (1 + TIE)) + 1)])
     return Tested(read_only(f), read_only(p), read_only(as_large / len(largest)), read_only(q), critical)

@@ -1,4 +1,4 @@
-"""Do groups differ, and with what: linear models of shape on covariates, tested by permutation of residuals.
+"""Linear models of shape on covariates, with tests of their terms by permutation of residuals.
 
 Collyer and Adams, RRPP, Methods in Ecology and Evolution 9, 2018; Freedman and Lane, J. Business & Economic Statistics
 1(4), 1983; Goodall, JRSS B 53(2), 1991.
@@ -54,7 +54,7 @@ from shapespace.types import FloatArray, read_only, require
 
 SquaresType: TypeAlias = Literal["I", "II", "III"]
 TYPES: tuple[SquaresType, ...] = ("I", "II", "III")
-"""Of sums of squares: of a term after those before it, after all that do not contain it, or after all others."""
+"""Types of sums of squares: of a term after those before it, after all that do not contain it, or after all others."""
 
 VertexWeights: TypeAlias = Literal["confidence", "none"]
 ErrorPermutation: TypeAlias = Literal["units", "residuals"]
@@ -68,7 +68,7 @@ MOST_LEVELS = 6
 
 @dataclass(frozen=True, kw_only=True)
 class CompareConfig:
-    """How groups are compared.
+    """Options of a comparison of groups.
 
     Args:
         anova_type: type of the sums of squares: `I`, each term after those before it; `II`, each term after all terms
@@ -78,25 +78,27 @@ class CompareConfig:
         permutations: number of permutations, including the observed data.
         seed: seed of the permutations.
         maps: whether to test each vertex.
-        bump_width_mm: of fits: also search, at each vertex, for a bump of this width (standard deviation, mm) along the
-            normals, beyond the variation between shapes.
+        bump_width_mm: width (standard deviation, mm) of a bump along the normals that is also searched for at each
+            vertex, beyond the variation between shapes; for fits only (default: no search).
         alpha: level of significance.
         drop_missing: exclude shapes with missing values in the table (default: an error).
-        random: random effects: those within subjects that differ between subjects, such as `1 + time | subject`; all
-            others are assumed to be equal in all subjects (default with blocks: all).
-        variances: of the classes: `equal` permutes residuals, `unequal` has a variance for each subject and flips the
-            signs of residuals, `auto` uses `unequal` if classes may differ in dispersion: p of its test is at most 0.3,
-            or 0.05 for classes of the same size.
-        effect_size: transformation of F in the effect size Z: `box-cox`, as in RRPP from version 0.6, or `log`, as
-            before.
-        weights: of the vertices in the sums of squares: `confidence`, smaller where the position along the surface is
-            uncertain, if all surfaces are from a correspondence that has estimated this; `none`: all are equal.
-        errors: term -> error term, over whose mean square its F is computed, such as `genus` -> `genus:species`
+        random: random effects: the effects within subjects that differ between subjects, such as `1 + time | subject`;
+            all others are assumed to be equal in all subjects (default with blocks: all).
+        variances: assumption on the variances of the classes: `equal` permutes residuals, `unequal` has a variance for
+            each subject and flips the signs of residuals, `auto` uses `unequal` if classes may differ in dispersion: p
+            of its test is at most 0.3, or 0.05 for classes of the same size.
+        effect_size: transformation of F in the effect size Z: `box-cox`, as in RRPP from version 0.6, or `log`, as in
+            earlier versions.
+        weights: weights of the vertices in the sums of squares: `confidence`, smaller where the position along the
+            surface is uncertain, if all surfaces are from a correspondence that has estimated this; `none`: equal
+            weights.
+        errors: term -> error term, whose mean square is the denominator of its F, such as `genus` -> `genus:species`
             (default: the residuals).
-        error_permutation: of tests with an error term: `units` permutes the mean residuals of its classes, such as
-            species; `residuals` those of single shapes, as RRPP, whose level is wrong if the classes vary.
-        coding: of classes, on which tests of type III depend: `deviation` from their mean, or `treatment`, differences
-            from the first class, the default of R.
+        error_permutation: permuted residuals in tests with an error term: `units` permutes the mean residuals of its
+            classes, such as species; `residuals` those of single shapes, as RRPP, whose level is wrong if the classes
+            vary.
+        coding: coding of classes, on which tests of type III depend: `deviation` from their mean, or `treatment`,
+            differences from the first class, the default of R.
     """
 
     anova_type: SquaresType = "II"
@@ -129,9 +131,9 @@ class CompareConfig:
         if self.variances not in VARIANCES:
             raise InputError(f"There are no variances {self.variances!r}; choose one of {', '.join(VARIANCES)}.")
         if self.errors and self.variances == "unequal":
-            raise InputError("Tests with error terms assume equal variances; leave out one of the two.")
+            raise InputError("Tests with error terms assume equal variances; remove one of the two options.")
         if self.coding == "treatment" and (self.blocks or self.random):
-            raise InputError("Blocks and random terms need deviation coding; leave out the other coding.")
+            raise InputError("Blocks and random terms need deviation coding; remove the option coding.")
         if self.bump_width_mm is not None and not 0 < self.bump_width_mm < math.inf:
             raise InputError(f"The width of bumps must be millimetres above 0, not {self.bump_width_mm}.")
 
@@ -141,19 +143,19 @@ class TermTest:
     """A row of the Procrustes analysis of variance.
 
     Args:
-        term: as it is called.
-        stratum: in which it is tested; empty where there is one.
+        term: name of the term.
+        stratum: stratum in which the term is tested; empty if there is only one.
         df: degrees of freedom.
         squares: sum of squares, mm².
-        r2: its share of the total of the stratum.
+        r2: share of the total sum of squares of the stratum.
         f: mean square divided by that of the residuals; with unequal variances, squared effect divided by its variance.
         z: F in standard deviations above the mean of its arrangements, after `CompareConfig.effect_size`.
         p: share of arrangements with an F as large, the observed one among them.
         arrangements: (P,) F of each, the observed one first.
-        error: whose mean square F is divided by.
+        error: name of the error term whose mean square is the denominator of F.
         unequal_variances: whether F allows classes of unequal dispersion.
-        f_other: F under the other assumption on variances; None without classes, or where that is not available.
-        p_other: the same of p.
+        f_other: F under the other assumption on variances; None without classes, or if that test is not available.
+        p_other: p under the other assumption on variances; None if `f_other` is None.
     """
 
     term: str
@@ -178,9 +180,9 @@ class StratumSummary:
     """Residuals and total of a stratum.
 
     Args:
-        stratum: its name.
+        stratum: name of the stratum.
         df: degrees of freedom of the residuals.
-        squares: their sum of squares, mm².
+        squares: sum of squares of the residuals, mm².
         df_total: degrees of freedom of the total.
         squares_total: total sum of squares, mm².
         log_arrangements: logarithm of the number of different arrangements, for the term with the fewest.
@@ -196,23 +198,23 @@ class StratumSummary:
 
 @dataclass(frozen=True, eq=False)
 class ShapeEffect:
-    """What differs between two values of a variable, all other variables being the same.
+    """Difference of shape between two values of a variable, all other variables being the same.
 
     Args:
-        name: of the variable, or of two that interact.
-        low: what the change is from, such as `sex female`.
-        high: what it is to.
-        stratum: in which it is tested.
+        name: name of the variable, or of two that interact.
+        low: value from which shape changes, such as `sex female`.
+        high: value to which shape changes.
+        stratum: stratum in which the effect is tested.
         change: (K,) mm, as coefficients of the cohort; from low to high.
         at_low: (K,) the shape at low.
         at_high: (K,) the shape at high.
         distance_mm: Procrustes distance, the root of the squared changes summed over vertices.
-        rms_mm: root of their mean.
+        rms_mm: root of the squared changes averaged over vertices.
         f: squared distance by its variance.
-        z: F in standard deviations above the mean of its arrangements, after `CompareConfig.effect_size`.
+        z: F in standard deviations above the mean of its arrangements, after the transformation `effect_size`.
         p: share of arrangements with an F as large.
-        p_family: the same by the largest F of all pairs of classes of this variable.
-        map: vertex by vertex; None where it was not asked for.
+        p_family: share of arrangements whose largest F of all pairs of classes of this variable is as large.
+        map: tests of the effect at each vertex; None if not requested.
         exploratory: whether no term of this effect is significant; its map is then exploratory.
     """
 
@@ -236,7 +238,7 @@ class ShapeEffect:
 
     @property
     def label(self) -> str:
-        """What is compared, in words."""
+        """The compared values, in words."""
         return f"{self.low} to {self.high.removeprefix(f'{self.name} ')}"
 
 
@@ -245,11 +247,12 @@ class EffectAngle:
     """The angle between two changes of shape.
 
     Args:
-        first: one change.
-        second: the other change.
-        degrees: the angle.
-        p: of the test whether they are parallel; None where that is not tested or not known.
-        unknown_p: why p is not known: neither change is longer than its noise. None where it is, or is not tested.
+        first: label of one change.
+        second: label of the other change.
+        degrees: angle between the changes, degrees.
+        p: p of the test whether the changes are parallel; None if it is not tested or not known.
+        unknown_p: reason why p is not known: neither change is longer than its noise. None if p is known, or not
+            tested.
     """
 
     first: str
@@ -264,18 +267,18 @@ class CompareResult(AnalysisResult):
     """A linear model of shapes on covariates, with its tests.
 
     Args:
-        cohort: whose shapes they are, as far as they were used.
-        design: the columns.
+        cohort: cohort of the compared shapes, without excluded shapes.
+        design: columns of the model.
         config: options of the comparison.
-        tests: of the terms.
-        strata: Residual degrees of freedom and sums of squares of each stratum.
-        effects: of the variables, and of pairs of them that interact.
-        angles: between effects.
-        n_subjects: number of subjects; that of shapes where all are independent.
+        tests: tests of the terms.
+        strata: residual degrees of freedom and sums of squares of each stratum.
+        effects: effects of the variables, and of pairs of variables that interact.
+        angles: angles between effects.
+        n_subjects: number of subjects; number of shapes if all are independent.
         dispersions: tests of equal dispersion of the classes of each variable between subjects.
         methods: sample sizes, tests and assumptions.
-        repeated_measures: how several shapes of a subject enter the tests; None where all shapes are independent.
-        imputations: those that p values combine; None without samples of completed shapes.
+        repeated_measures: use of several shapes of a subject in the tests; None if all shapes are independent.
+        imputations: imputations that p values combine; None without samples of completed shapes.
 
     Example:
         >>> config = ss.statistics.CompareConfig(permutations=99)
@@ -299,7 +302,7 @@ class CompareResult(AnalysisResult):
 
     @cached_property
     def mean(self) -> FloatArray:
-        """(K,) of the shapes."""
+        """(K,) mean coefficients of the shapes."""
         return read_only(self.cohort.coefficients.mean(axis=0))
 
     @property
@@ -311,7 +314,7 @@ class CompareResult(AnalysisResult):
         """Return the test of a term.
 
         Raises:
-            InputError: there is none of that name.
+            InputError: there is no term of that name.
         """
         matches = [test for test in self.tests if test.term == term]
         if not matches:
@@ -324,7 +327,7 @@ class CompareResult(AnalysisResult):
 
 
 def _update(result: CompareResult) -> CompareResult:
-    """Return a comparison in which all that depends on p follows those of its tests."""
+    """Return a comparison whose values that depend on p agree with its tests."""
     effects = tuple(
         replace(effect, exploratory=_is_exploratory(effect, result.design, result.tests, result.config))
         for effect in result.effects
@@ -347,31 +350,31 @@ def compare(
     *,
     progress: Callable[[int, int], None] | None = None,
 ) -> CompareResult:
-    """Return the linear model of a cohort's shapes on what the formula names, tested by permutation of residuals.
+    """Return the linear model of a cohort's shapes on the variables of a formula, tested by permutation of residuals.
 
-    `size` and `log_size`, the centroid size in mm and its logarithm, may stand in the formula beside the columns of the
-    table.
+    The formula may contain the columns of the table and also `size` and `log_size`, the centroid size in mm and its
+    logarithm.
 
     If completed shapes have samples, each imputation is tested too, and p values combine them by Rubin's rules.
 
     Args:
         cohort: the shapes and their table.
-        formula: such as `~ sex + age`.
-        config: None for the defaults.
-        progress: called with (done, total).
+        formula: formula of the model, such as `~ sex + age`.
+        config: options; None for the defaults.
+        progress: function called with (done, total).
 
     Raises:
-        InputError: a formula that cannot be read, columns that are not there, missing values, one group, a constant
-            covariate, terms that are linear combinations of others, more columns than shapes, an effect within subjects
-            that too few subjects show, or unequal variances with a class of one shape or for an effect that is assumed
-            to be the same in all subjects.
+        InputError: a formula that cannot be read, missing columns or values, one group, a constant covariate, terms
+            that are linear combinations of others, more columns than shapes, an effect within subjects that too few
+            subjects show, or unequal variances with a class of one shape or for an effect that is assumed to be the
+            same in all subjects.
         ShapespaceError: the extra `statistics` is not installed.
     """
     require(cohort, Cohort, "compare", "read one with shapespace.read_cohort")
     require(formula, str, "compare", "write a formula such as '~ sex + age'")
     config = config or CompareConfig()
     require(config, CompareConfig, "compare", "give the options as CompareConfig(...)")
-    random, config = _random(config, cohort)
+    random, config = _random_effects(config, cohort)
     cohort = complete_cohort(
         cohort, [formula], [config.blocks] if config.blocks else [], drop_missing=config.drop_missing
     )
@@ -392,11 +395,11 @@ def compare(
     errors = {name: _error_terms(strata, design, name, error) for name, error in config.errors.items()}
     errors = {term.label: error for term, error in errors.values()}
     made, among = _with_units(made, errors, design)
-    families = [_weighted(cohort, design, family) for family in _families(design, made)]
+    families = [_add_weights(cohort, design, family) for family in _families(design, made)]
     total = len(design.terms) + len(families) * (1 + config.maps)
     step = StepCounter(total, progress).add
-    crossed = {one for term in design.terms if not is_nested(term, design.terms) for one in term.variables}
-    columns = {one.name: one.column for one in design.variables}
+    crossed = {name for term in design.terms if not is_nested(term, design.terms) for name in term.variables}
+    columns = {variable.name: variable.column for variable in design.variables}
     asked = config.variances == "unequal"
     units = [units_of(stratum, design, owners) if asked or is_between_units(stratum) else None for stratum in strata]
     dispersions = tuple(
@@ -427,7 +430,7 @@ def compare(
         tests=tests,
         strata=tuple(_summarise_stratum(stratum, tests, among if stratum is strata[0] else ()) for stratum in strata),
         effects=effects,
-        angles=(*_parallel(design, made, config, owners, unequal=unequal), *_between(effects)),
+        angles=(*_interaction_angles(design, made, config, owners, unequal=unequal), *_effect_angles(effects)),
         n_subjects=len(set(subjects)) if subjects is not None else len(cohort),
         dispersions=dispersions,
         methods=methods,
@@ -447,9 +450,9 @@ def complete_cohort(
 
     Args:
         cohort: the shapes.
-        formulas: of models; numbers in them that may be codes of classes are in the cohort's `cautions`.
+        formulas: formulas of models; numbers in them that may be codes of classes are in the cohort's `cautions`.
         columns: further columns, of classes.
-        drop_missing: leave out shapes with missing values (default: an error).
+        drop_missing: whether to exclude shapes with missing values (default: an error).
         numbers: further columns, of numbers.
 
     Raises:
@@ -466,8 +469,8 @@ def complete_cohort(
     unknown = int(np.isnan(cohort.sizes_mm).sum())
     if unknown and not (drop_missing or cohort.drop_missing) and {"size", "log_size"} & set(named) - own:
         raise InputError(
-            f"The size of {unknown} of {len(cohort)} shapes is not known in mm; fit them with --unit, or leave them "
-            "out with --set missing=drop."
+            f"The size of {unknown} of {len(cohort)} shapes is not known in mm; fit them with --unit, or exclude them "
+            "with --set missing=drop."
         )
     table = cohort.table
     in_formulas = [column for column in calls if "C" not in calls[column] and table.kind(column) == "number"]
@@ -485,12 +488,12 @@ def _error_terms(strata: Sequence[Stratum], design: Design, name: str, error: st
         InputError: they are not in the model or in one stratum, or the error is no group of the term's classes.
     """
     found: list[tuple[Term, Stratum]] = []
-    for one in (name, error):
-        wanted = sorted(one.replace(" ", "").split(":"))
+    for label in (name, error):
+        wanted = sorted(label.replace(" ", "").split(":"))
         own = [(t, s) for s in strata for t in s.terms if sorted(t.label.replace(" ", "").split(":")) == wanted]
         if not own:
             terms = ", ".join(term.label for term in design.terms)
-            raise InputError(f"There is no term {one[:60]!r} in {design.formula!r}; choose from {terms}.")
+            raise InputError(f"There is no term {label[:60]!r} in {design.formula!r}; choose from {terms}.")
         found += own[:1]
     (term, stratum), (error_term, other) = found
     if not term.factors < error_term.factors:
@@ -499,8 +502,8 @@ def _error_terms(strata: Sequence[Stratum], design: Design, name: str, error: st
             "species."
         )
     if stratum is not other or stratum.scheme != "permute" or np.ptp(stratum.groups):
-        raise InputError(f"{name!r} and {error!r} are not tested between the same subjects; leave out one of them.")
-    if any(one.column in error_term.variables and not one.levels for one in design.variables):
+        raise InputError(f"{name!r} and {error!r} are not tested between the same subjects; remove one of the two.")
+    if any(variable.column in error_term.variables and not variable.levels for variable in design.variables):
         raise InputError(f"The error term {error!r} contains a column of numbers; write C(column) for classes.")
     return term, error_term
 
@@ -508,7 +511,7 @@ def _error_terms(strata: Sequence[Stratum], design: Design, name: str, error: st
 def _with_units(
     made: ModelStrata, errors: Mapping[str, Term], design: Design
 ) -> tuple[ModelStrata, tuple[Stratum, ...]]:
-    """Return the strata of effects, in which those with an error term are tested on means of its units, and these."""
+    """Return the strata of effects and the new strata, with tests of terms with an error term on means of its units."""
     if not errors:
         return made, ()
     first = made.every[0]
@@ -520,7 +523,7 @@ def _with_units(
     return replace(made, every=(*among, rest, *made.every[1:])), among
 
 
-def _random(config: CompareConfig, cohort: Cohort) -> tuple[tuple[frozenset[str], ...] | None, CompareConfig]:
+def _random_effects(config: CompareConfig, cohort: Cohort) -> tuple[tuple[frozenset[str], ...] | None, CompareConfig]:
     """Return the random effects, None for all, and the options with the column of subjects as their blocks."""
     if config.random is None:
         return None, config
@@ -534,7 +537,7 @@ def _weight_root(cohort: Cohort) -> FloatArray | None:
     """Return L (K, K), so that coefficients C have the sums of squares of C L with vertices weighted by confidence.
 
     The weight is v / (v + s^2), with the variance v of a coordinate, mean over the vertices, and `position_std` s. It
-    does not depend on the table, so that rows stay exchangeable. None where `position_std` is not known.
+    does not depend on the table, so that rows stay exchangeable. None if `position_std` is not known.
     """
     if cohort.position_std is None:
         return None
@@ -566,7 +569,7 @@ def _methods(
             flips = unequal or stratum.flips(reduced)
             own, error = unit if is_between_units(stratum) else f"difference within a {unit}", errors.get(term.label)
             if error is not None and config.error_permutation == "units":
-                own, reduced = f"{error.label} unit", [one for one in reduced if one is not error]
+                own, reduced = f"{error.label} unit", [other for other in reduced if other is not error]
             schemes.append(
                 TestScheme(
                     tested=(term.label,),
@@ -579,15 +582,15 @@ def _methods(
                     unequal_variances=unequal,
                 )
             )
-    classes = [(one.name, design.groups_of(one)) for one in design.variables if one.groups]
-    several = any(len(_pairs(one)) > 1 for one in design.variables)
+    classes = [(variable.name, design.groups_of(variable)) for variable in design.variables if variable.groups]
+    several = any(len(_pairs(variable)) > 1 for variable in design.variables)
     return methods_of(
         cohort,
         len(set(owners)),
         level=config.alpha,
         sizes=sample_sizes(owners, classes),
         tests=tuple(schemes),
-        dispersions=tuple(dispersion_record(one, config.alpha) for one in dispersions),
+        dispersions=tuple(dispersion_record(test, config.alpha) for test in dispersions),
         unequal_variances=bool(allowing) if classes else None,
         effect_size=config.effect_size,
         r2_strata=tuple(stratum.name for stratum in strata),
@@ -600,7 +603,7 @@ def _methods(
 
 def _is_exploratory(effect: ShapeEffect, design: Design, tests: Sequence[TermTest], config: CompareConfig) -> bool:
     """Return whether no term that contains the variables of an effect is significant."""
-    names = {one.column for one in design.variables if one.name in effect.name.split(":")}
+    names = {variable.column for variable in design.variables if variable.name in effect.name.split(":")}
     own = {term.label for term in design.terms if names <= term.variables}
     return not any(test.term in own and test.p <= config.alpha for test in tests)
 
@@ -618,9 +621,9 @@ def term_tests(
 
     Args:
         stratum: the stratum.
-        config: of the comparison.
-        step: called after each term.
-        units: of the stratum, to test with unequal variances too; None where that is not available.
+        config: options of the comparison.
+        step: function called after each term.
+        units: units of the stratum, to test with unequal variances too; None if that is not available.
         errors: error terms by the names of terms; None for the residuals.
         unequal: whether unequal variances are reported first if they are available.
 
@@ -680,7 +683,7 @@ def _error_f(stratum: Stratum, term: Term, error: Term, config: CompareConfig) -
     own, noise = _own_columns(stratum, term, config), _own_columns(stratum, error, config)
     reduced, count = stratum.reduced(term, config.anova_type), own.shape[1]
     if config.error_permutation == "units":
-        left = [one for one in reduced if one is not error]
+        left = [other for other in reduced if other is not error]
         within = float((stratum.residual([*stratum.nuisance, *stratum.terms]) ** 2).sum()) / stratum.df_error
         among = float(((noise.T @ stratum.shapes) ** 2).sum()) / noise.shape[1]
         size = len(stratum.matrix) / (1 + int(stratum.error_units(error).max()))
@@ -707,7 +710,7 @@ def _summarise_stratum(stratum: Stratum, tests: Sequence[TermTest], among: Seque
         squares=float((stratum.residual(stratum.terms) ** 2).sum()),
         df_total=len(stratum.matrix) - stratum.removed,
         squares_total=float((stratum.shapes**2).sum()),
-        log_arrangements=min(one.fewest_log_arrangements(flips=unequal) for one in (stratum, *among)),
+        log_arrangements=min(own.fewest_log_arrangements(flips=unequal) for own in (stratum, *among)),
     )
 
 
@@ -733,13 +736,13 @@ class _ContrastFamily:
 
 def _families(design: Design, strata: ModelStrata) -> Iterator[_ContrastFamily]:
     within = strata.within
-    for one in design.variables:
-        alone = [term for term in design.terms if term.variables == frozenset({one.column})]
-        wanted = alone or [term for term in design.terms if one.column in term.variables]
-        both = frozenset({one.column})
+    for variable in design.variables:
+        alone = [term for term in design.terms if term.variables == frozenset({variable.column})]
+        wanted = alone or [term for term in design.terms if variable.column in term.variables]
+        both = frozenset({variable.column})
         if within is not None and within.holds(both):
-            ends = [_within_ends(within, one, low, high) for low, high in _pairs(one)]
-            yield _ContrastFamily(one.name, tuple(ends))
+            ends = [_within_ends(within, variable, low, high) for low, high in _pairs(variable)]
+            yield _ContrastFamily(variable.name, tuple(ends))
             continue
         for stratum in strata.every:
             own = [term for term in wanted if term in stratum.terms]
@@ -748,20 +751,24 @@ def _families(design: Design, strata: ModelStrata) -> Iterator[_ContrastFamily]:
                 reduced = tuple(stratum.without(both))
                 ends = [
                     _Contrast(
-                        one.describe(low), one.describe(high), stratum, reduced, design.contrast(one.column, low, high)
+                        variable.describe(low),
+                        variable.describe(high),
+                        stratum,
+                        reduced,
+                        design.contrast(variable.column, low, high),
                     )
-                    for low, high in _pairs(one)
+                    for low, high in _pairs(variable)
                 ]
-                yield _ContrastFamily(one.name, tuple(ends))
-    for one, other in _interacting(design):
-        both = frozenset({one.column, other.column})
-        (low, high), (first, second) = _pairs(one)[0], _pairs(other)[0]
-        levels_text, name = _levels_text(one, low, high), f"{one.name}:{other.name}"
+                yield _ContrastFamily(variable.name, tuple(ends))
+    for variable, other in _interacting_pairs(design):
+        both = frozenset({variable.column, other.column})
+        (low, high), (first, second) = _pairs(variable)[0], _pairs(other)[0]
+        levels_text, name = _levels_text(variable, low, high), f"{variable.name}:{other.name}"
         words = f"{levels_text} at {other.describe(first)}", f"the same at {other.describe(second)}"
         if within is not None and within.holds(both):
-            yield _ContrastFamily(name, (_within_interaction(within, one, other, words),))
+            yield _ContrastFamily(name, (_within_interaction(within, variable, other, words),))
             continue
-        change = [design.contrast(one.column, low, high, {other.column: value}) for value in (first, second)]
+        change = [design.contrast(variable.column, low, high, {other.column: value}) for value in (first, second)]
         for stratum in strata.every:
             if any(both <= term.variables for term in stratum.terms):
                 yield _ContrastFamily(
@@ -769,19 +776,19 @@ def _families(design: Design, strata: ModelStrata) -> Iterator[_ContrastFamily]:
                 )
 
 
-def _weighted(cohort: Cohort, design: Design, family: _ContrastFamily) -> _ContrastFamily:
-    """Return a family with the share of the information on each contrast that the observations of a vertex carry.
+def _add_weights(cohort: Cohort, design: Design, family: _ContrastFamily) -> _ContrastFamily:
+    """Return a family with weights: the share of the information on each contrast that each vertex observes.
 
-    The scans of a subject count one by one, also where a test combines them.
+    The scans of a subject are counted separately, also where a test combines them.
     """
     contrasts: list[FloatArray] = []
-    for one in design.variables:
-        if one.name == family.name:
-            contrasts = [design.contrast(one.column, low, high) for low, high in _pairs(one)]
-    for one, other in _interacting(design):
-        if f"{one.name}:{other.name}" == family.name:
-            (low, high), values = _pairs(one)[0], _pairs(other)[0]
-            first, second = (design.contrast(one.column, low, high, {other.column: value}) for value in values)
+    for variable in design.variables:
+        if variable.name == family.name:
+            contrasts = [design.contrast(variable.column, low, high) for low, high in _pairs(variable)]
+    for variable, other in _interacting_pairs(design):
+        if f"{variable.name}:{other.name}" == family.name:
+            (low, high), values = _pairs(variable)[0], _pairs(other)[0]
+            first, second = (design.contrast(variable.column, low, high, {other.column: value}) for value in values)
             contrasts = [second - first]
     # Nested terms have columns that are not independent, and contrasts average over their classes.
     columns = [c for term in design.terms if not is_nested(term, design.terms) for c in term.columns]
@@ -792,25 +799,31 @@ def _weighted(cohort: Cohort, design: Design, family: _ContrastFamily) -> _Contr
     return replace(family, ends=tuple(replace(e, weight=w) for e, w in zip(family.ends, weights, strict=True)))
 
 
-def _within_ends(within: WithinSubjects, one: Variable, low: str | float, high: str | float) -> _Contrast:
+def _within_ends(within: WithinSubjects, variable: Variable, low: str | float, high: str | float) -> _Contrast:
     """Return the change of a variable within subjects, at the average of the variables between subjects."""
-    own = frozenset({one.column})
+    own = frozenset({variable.column})
     stratum, between = within.contrast_stratum(
-        within.effects.contrast(one.column, low, high), own, _levels_text(one, low, high)
+        within.effects.contrast(variable.column, low, high), own, _levels_text(variable, low, high)
     )
-    return _Contrast(one.describe(low), one.describe(high), stratum, tuple(stratum.without(own)), between.average({}))
+    return _Contrast(
+        variable.describe(low), variable.describe(high), stratum, tuple(stratum.without(own)), between.average({})
+    )
 
 
-def _within_interaction(within: WithinSubjects, one: Variable, other: Variable, words: tuple[str, str]) -> _Contrast:
-    """Return the contrast of two variables of which one or both differ within subjects."""
-    both = frozenset({one.column, other.column})
-    (low, high), (first, second) = _pairs(one)[0], _pairs(other)[0]
-    name = f"{one.name}:{other.name}"
+def _within_interaction(
+    within: WithinSubjects, variable: Variable, other: Variable, words: tuple[str, str]
+) -> _Contrast:
+    """Return the contrast of two variables, if one or both differ within subjects."""
+    both = frozenset({variable.column, other.column})
+    (low, high), (first, second) = _pairs(variable)[0], _pairs(other)[0]
+    name = f"{variable.name}:{other.name}"
     if both <= within.variables:
-        change = [within.effects.contrast(one.column, low, high, {other.column: value}) for value in (first, second)]
+        change = [
+            within.effects.contrast(variable.column, low, high, {other.column: value}) for value in (first, second)
+        ]
         stratum, between = within.contrast_stratum(change[1] - change[0], both, name)
         return _Contrast(*words, stratum, tuple(stratum.without(both)), between.average({}))
-    inner, outer = (one, other) if one.column in within.variables else (other, one)
+    inner, outer = (variable, other) if variable.column in within.variables else (other, variable)
     (low, high), (first, second) = _pairs(inner)[0], _pairs(outer)[0]
     contrast = within.effects.contrast(inner.column, low, high)
     stratum, between = within.contrast_stratum(contrast, frozenset({inner.column}), name)
@@ -818,22 +831,22 @@ def _within_interaction(within: WithinSubjects, one: Variable, other: Variable, 
 
 
 def _pairs(variable: Variable) -> list[tuple[str, str]] | list[tuple[float, float]]:
-    """Return the pairs of values between which a change is shown."""
+    """Return the pairs of values whose change of shape is reported."""
     if variable.levels:
         return list(itertools.combinations(variable.levels[:MOST_LEVELS], 2))
     return [(variable.low, variable.high)]
 
 
-def _levels_text(one: Variable, low: str | float, high: str | float) -> str:
-    return f"{one.describe(low)} to {one.describe(high).removeprefix(f'{one.name} ')}"
+def _levels_text(variable: Variable, low: str | float, high: str | float) -> str:
+    return f"{variable.describe(low)} to {variable.describe(high).removeprefix(f'{variable.name} ')}"
 
 
-def _interacting(design: Design) -> Iterator[tuple[Variable, Variable]]:
+def _interacting_pairs(design: Design) -> Iterator[tuple[Variable, Variable]]:
     """Yield pairs of variables with one change each that share a term."""
-    for one, other in itertools.combinations(design.variables, 2):
-        together = any({one.column, other.column} <= term.variables for term in design.terms)
-        if together and len(one.levels) <= 2 and len(other.levels) <= 2:
-            yield one, other
+    for variable, other in itertools.combinations(design.variables, 2):
+        together = any({variable.column, other.column} <= term.variables for term in design.terms)
+        if together and len(variable.levels) <= 2 and len(other.levels) <= 2:
+            yield variable, other
 
 
 def _effects(
@@ -848,7 +861,7 @@ def _effects(
     unequal: bool,
 ) -> Iterator[ShapeEffect]:
     parts = [list(own) for _, own in itertools.groupby(family.ends, key=lambda ends: id(ends.stratum))]
-    made = [_tested_together(cohort, own, design, subjects, config, root, unequal=unequal) for own in parts]
+    made = [_test_together(cohort, own, design, subjects, config, root, unequal=unequal) for own in parts]
     largest = np.max([f for f, _, _ in made for f in f], axis=0)
     mean = cohort.coefficients.mean(axis=0)
     step()
@@ -875,7 +888,7 @@ def _effects(
             )
 
 
-def _tested_together(
+def _test_together(
     cohort: Cohort,
     family: Sequence[_Contrast],
     design: Design,
@@ -891,7 +904,7 @@ def _tested_together(
         available = is_between_units(stratum) and stratum.width == 1
         units = units_of(stratum, design, subjects) if available or config.variances == "unequal" else None
         if units is not None and (config.variances == "unequal" or units.is_comparable):
-            return _tested_unequal(cohort, family, units, config, root)
+            return _test_unequal(cohort, family, units, config, root)
     residual, flips = stratum.residual(reduced), stratum.flips(reduced)
     directions = np.stack([stratum.direction(ends.contrast) for ends in family])
     lengths = np.maximum(np.linalg.norm(directions, axis=1), 1e-300)
@@ -918,14 +931,14 @@ def _tested_together(
     return f, changes, maps
 
 
-def _tested_unequal(
+def _test_unequal(
     cohort: Cohort, family: Sequence[_Contrast], units: Units, config: CompareConfig, root: FloatArray | None
 ) -> tuple[FloatArray, FloatArray, Sequence[EffectMap | None]]:
-    """Return what `_tested_together` does, with unequal variances."""
+    """Return the result of `_test_together` with unequal variances."""
     stratum = units.stratum
     if stratum.width > 1:
         raise InputError(
-            f"Unequal variances are not available for several contrasts of {stratum.name} at once; leave out "
+            f"Unequal variances are not available for several contrasts of {stratum.name} at once; remove "
             "--variances unequal."
         )
     statistics: list[FloatArray] = []
@@ -960,24 +973,24 @@ def _tested_unequal(
     return np.stack(statistics), np.stack(changes), maps
 
 
-def _parallel(
+def _interaction_angles(
     design: Design, strata: ModelStrata, config: CompareConfig, owners: Sequence[str] | None, *, unequal: bool
 ) -> Iterator[EffectAngle]:
-    """Yield angles between what a variable changes in one class of another and in the next, where they interact.
+    """Yield the angle between the changes by a variable in two classes of another variable, if both interact.
 
     The arrangements are those of the model without the interaction, where these changes are the same.
     """
-    for one, other in itertools.permutations(design.variables, 2):
-        both = frozenset({one.column, other.column})
+    for variable, other in itertools.permutations(design.variables, 2):
+        both = frozenset({variable.column, other.column})
         together = [term for term in design.terms if term.variables == both]
-        main = [term for term in design.terms if term.variables == frozenset({one.column})]
-        if not together or not main or len(one.levels) > 2 or not other.levels:
+        main = [term for term in design.terms if term.variables == frozenset({variable.column})]
+        if not together or not main or len(variable.levels) > 2 or not other.levels:
             continue
         levels = other.levels[:MOST_LEVELS]
-        words = [f"{_levels_text(one, *_pairs(one)[0])}, {other.describe(level)}" for level in levels]
+        words = [f"{_levels_text(variable, *_pairs(variable)[0])}, {other.describe(level)}" for level in levels]
         pairs = list(itertools.combinations(range(len(levels)), 2))
         for (first, second), (drawn, weights) in zip(
-            pairs, _changes_in_pairs(design, strata, one, other, config, owners, unequal=unequal), strict=False
+            pairs, _changes_in_pairs(design, strata, variable, other, config, owners, unequal=unequal), strict=False
         ):
             angle = float(angles_between(drawn[0][:1], drawn[1][:1])[0])
             is_known = any(own * (change[0] ** 2).sum() > 1.0 for change, own in zip(drawn, weights, strict=True))
@@ -986,28 +999,28 @@ def _parallel(
 
 
 def _changes_in_pairs(
-    design: Design, strata: ModelStrata, one: Variable, other: Variable, config: CompareConfig,
+    design: Design, strata: ModelStrata, variable: Variable, other: Variable, config: CompareConfig,
     owners: Sequence[str] | None, *, unequal: bool,
 ) -> Iterator[tuple[tuple[FloatArray, FloatArray], tuple[float, float]]]:  # fmt: skip
     """Yield the changes (P, K) by a variable in the two classes of each pair of another, and their precisions.
 
     There are none if the changes of the two variables belong to different strata.
     """
-    both = frozenset({one.column, other.column})
-    low, high = _pairs(one)[0]
+    both = frozenset({variable.column, other.column})
+    low, high = _pairs(variable)[0]
     levels = other.levels[:MOST_LEVELS]
     within = strata.within
     if (
         within is not None
         and within.holds(both)
-        and one.column in within.variables
+        and variable.column in within.variables
         and other.column in within.variables
     ):
         # Both within subjects: each arrangement exchanges the two changes in some subjects.
-        own = [within.effects.contrast(one.column, low, high, {other.column: level}) for level in levels]
+        own = [within.effects.contrast(variable.column, low, high, {other.column: level}) for level in levels]
         for first, second in itertools.combinations(own, 2):
-            half, between = within.contrast_stratum((first - second) / 2, both, f"{one.name}:{other.name}")
-            middle, parts = within.contrast_stratum((first + second) / 2, frozenset({one.column}), one.name)
+            half, between = within.contrast_stratum((first - second) / 2, both, f"{variable.name}:{other.name}")
+            middle, parts = within.contrast_stratum((first + second) / 2, frozenset({variable.column}), variable.name)
             direction = middle.direction(parts.average({}))
             mean, differ = direction @ middle.shapes, half.direction(between.average({}))
             noise, other_noise = (
@@ -1023,11 +1036,11 @@ def _changes_in_pairs(
     stratum, contrasts = None, list[FloatArray]()
     if within is None or not within.holds(both):
         stratum = next((s for s in strata.every if any(term.variables == both for term in s.terms)), None)
-        if stratum is not None and any(term.variables == frozenset({one.column}) for term in stratum.terms):
-            contrasts = [design.contrast(one.column, low, high, {other.column: level}) for level in levels]
-    elif one.column in within.variables:
-        contrast = within.effects.contrast(one.column, low, high)
-        stratum, between = within.contrast_stratum(contrast, frozenset({one.column}), one.name)
+        if stratum is not None and any(term.variables == frozenset({variable.column}) for term in stratum.terms):
+            contrasts = [design.contrast(variable.column, low, high, {other.column: level}) for level in levels]
+    elif variable.column in within.variables:
+        contrast = within.effects.contrast(variable.column, low, high)
+        stratum, between = within.contrast_stratum(contrast, frozenset({variable.column}), variable.name)
         contrasts = [between.average({other.column: level}) for level in levels]
     if stratum is not None and contrasts:
         units = units_of(stratum, design, owners) if unequal and is_between_units(stratum) else None
@@ -1065,12 +1078,12 @@ def _changes_of(
     return changes, 1.0 / max(float(direction**2 @ variances), 1e-300)
 
 
-def _between(effects: Sequence[ShapeEffect]) -> Iterator[EffectAngle]:
+def _effect_angles(effects: Sequence[ShapeEffect]) -> Iterator[EffectAngle]:
     """Yield angles between the effects of different variables."""
-    for one, other in itertools.combinations(effects, 2):
-        if one.name != other.name and ":" not in one.name + other.name:
-            angle = float(angles_between(one.change[None], other.change[None])[0])
-            yield EffectAngle(one.label, other.label, angle, None)
+    for effect, other in itertools.combinations(effects, 2):
+        if effect.name != other.name and ":" not in effect.name + other.name:
+            angle = float(angles_between(effect.change[None], other.change[None])[0])
+            yield EffectAngle(effect.label, other.label, angle, None)
 
 
 def angles_between(one: FloatArray, other: FloatArray) -> FloatArray:
@@ -1082,7 +1095,7 @@ def angles_between(one: FloatArray, other: FloatArray) -> FloatArray:
 def off_common_direction(one: FloatArray, other: FloatArray, weight: float, other_weight: float) -> FloatArray:
     """Return the (P,) weighted squared distance of vectors (P, K) from vectors of one common direction (S10a).
 
-    Unlike the angle it hardly depends on the length of the common vector, which is unknown.
+    Unlike the angle, it hardly depends on the length of the common vector, which is unknown.
     """
     first, second = weight * (one**2).sum(axis=1), other_weight * (other**2).sum(axis=1)
     product = math.sqrt(weight * other_weight) * (one * other).sum(axis=1)
@@ -1101,11 +1114,11 @@ class Units:
     Args:
         stratum: the stratum.
         shapes: (s, d K) mm, the d contrasts of a unit in one row.
-        matrix: (s, p) of its terms.
-        full: (s, m) orthonormal columns of the whole model, with the mean if it was removed.
+        matrix: (s, p) columns of its terms.
+        full: (s, m) orthonormal columns of the full model, with the mean if it was removed.
         rows: (s,) a row of the table of each unit.
-        design: of the whole model.
-        varying: names inside of the variables that differ within subjects.
+        design: columns of the full model.
+        varying: internal names of the variables that differ within subjects.
     """
 
     stratum: Stratum
@@ -1118,12 +1131,12 @@ class Units:
 
     @property
     def leverage(self) -> FloatArray:
-        """(s,) diagonal of the hat matrix of the whole model."""
+        """(s,) diagonal of the hat matrix of the full model."""
         return (self.full**2).sum(axis=1)
 
     @property
     def is_comparable(self) -> bool:
-        """Whether there are classes whose variances may differ, and no unit is fitted exactly by the whole model."""
+        """Whether there are classes whose variances may differ, and no unit is fitted exactly by the full model."""
         return float(self.leverage.max()) <= 1.0 - FULL_LEVERAGE and bool(self.grouping(self.stratum.terms))
 
     def columns(self, terms: Sequence[Term]) -> FloatArray:
@@ -1139,14 +1152,14 @@ class Units:
         """Return the (s,) combination of classes of each unit; None without a variable of classes."""
         if not variables:
             return None
-        cells = list(zip(*(self._values(one) for one in variables), strict=True))
+        cells = list(zip(*(self._values(variable) for variable in variables), strict=True))
         names = {cell: k for k, cell in enumerate(sorted(set(cells)))}
         return np.array([names[cell] for cell in cells], dtype=np.intp)
 
     def grouping(self, terms: Sequence[Term]) -> list[Variable]:
         """Return the variables of classes in some terms that are the same in all shapes of a unit."""
         named = {column for term in terms for column in term.variables} - self.varying
-        return [one for one in self.design.variables if one.column in named and one.groups]
+        return [variable for variable in self.design.variables if variable.column in named and variable.groups]
 
     def flips(
         self, terms: Sequence[Term], reduced: Sequence[Term], permutations: int, seed: int, name: str
@@ -1154,10 +1167,10 @@ class Units:
         """Return the sign flips of the residuals of a reduced model.
 
         Args:
-            terms: that are tested; the variances of their classes may differ.
+            terms: tested terms; the variances of their classes may differ.
             reduced: terms of the reduced model.
             permutations: number of sign flips, the observed data among them.
-            seed: of these.
+            seed: seed of the sign flips.
             name: name of the tested effect, for messages.
 
         Raises:
@@ -1175,14 +1188,14 @@ class Units:
 
     def dispersions(self, n_vertices: int, permutations: int, seed: int) -> Iterator[DispersionTest]:
         """Yield the tests of equal dispersion of the classes of each variable that differs between units."""
-        for one in self.grouping(self.stratum.terms):
-            codes = np.array([one.groups.index(value) for value in self._values(one)], dtype=np.intp)
+        for variable in self.grouping(self.stratum.terms):
+            codes = np.array([variable.groups.index(value) for value in self._values(variable)], dtype=np.intp)
             test = dispersion_test(
-                variable=one.name,
+                variable=variable.name,
                 shapes=self.shapes,
                 full=self.full,
                 codes=codes,
-                groups=one.groups,
+                groups=variable.groups,
                 n_vertices=n_vertices * self.stratum.width,
                 permutations=permutations,
                 seed=seed,
@@ -1196,8 +1209,8 @@ class Units:
         count = len(self.shapes)
         return np.full((count, 1 if self.stratum.removed else 0), count**-0.5)
 
-    def _values(self, one: Variable) -> list[str]:
-        groups = self.design.groups_of(one)
+    def _values(self, variable: Variable) -> list[str]:
+        groups = self.design.groups_of(variable)
         rows: list[int] = self.rows.tolist()
         return [groups[row] for row in rows]
 
@@ -1207,8 +1220,8 @@ def units_of(stratum: Stratum, design: Design, subjects: Sequence[str] | None) -
 
     Args:
         stratum: the stratum.
-        design: of the whole model.
-        subjects: N, whose shapes the rows of the table are; None where each shape is a unit.
+        design: columns of the full model.
+        subjects: N subjects, one for each row of the table; None if each shape is a unit.
 
     Raises:
         InputError: units are not exchangeable between subjects.
@@ -1217,7 +1230,7 @@ def units_of(stratum: Stratum, design: Design, subjects: Sequence[str] | None) -
         raise InputError(
             f"Unequal variances are not available for {', '.join(term.label for term in stratum.terms)}, which "
             f"{'are' if len(stratum.terms) > 1 else 'is'} tested within subjects under the assumption that all respond "
-            "alike; leave out --random, or --variances unequal."
+            "alike; remove --random, or --variances unequal."
         )
     d, count = stratum.width, len(stratum.groups)
     shapes = stratum.shapes.reshape(count, -1)

@@ -1,9 +1,9 @@
 """Strata of a linear model of shapes, and the arrangements under which their rows are exchangeable.
 
 Without blocks all shapes are exchangeable. Scans of one subject are not independent, so with blocks a model has several
-strata, as in the analysis of variance of repeated measures: means of subjects, which are permuted as wholes, and for
-each effect within subjects the contrasts or slopes of the subjects (`compare_within`), whose signs are flipped or which
-are permuted between subjects. An effect that is assumed to be the same in all subjects is tested on the differences of
+strata, as in the analysis of variance of repeated measures: means of subjects, which are permuted, and for each effect
+within subjects the contrasts or slopes of the subjects (`compare_within`), whose signs are flipped or which are
+permuted between subjects. An effect that is assumed to be the same in all subjects is tested on the differences of
 cells from the subject's mean, which are permuted within subjects (Winkler et al., NeuroImage 123, 2015).
 """
 
@@ -26,12 +26,12 @@ from shapespace.types import FloatArray
 
 Rows: TypeAlias = npt.NDArray[np.intp]
 Scheme: TypeAlias = Literal["permute", "flip", "subjects"]
-"""How rows are arranged: permuted, or with flipped signs; subjects either way, depending on the reduced model."""
+"""Arrangement of rows: permuted, or with flipped signs; `subjects` is either, depending on the reduced model."""
 
 _ALIASED = 1e-8  # relative length of a residual column; below it follows from the others
 _CONSTANT = 1e-9  # scale of a column of zeros, whose length would be zero
 _BATCH = 50
-"""Arrangements that are drawn from one seed."""
+"""Number of arrangements that are drawn from one seed."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -39,20 +39,20 @@ class Stratum:
     """Rows that are exchangeable, with the terms that are tested on them.
 
     Args:
-        name: such as `between subject`; empty where there is one stratum.
-        shapes: (n, K) mm, less the means that are removed.
-        matrix: (n, p) of these terms, less the same means.
-        columns: (p,) of the design.
-        terms: tested here.
+        name: name of the stratum, such as `between subject`; empty if there is only one stratum.
+        shapes: (n, K) shapes less the means that are removed, mm.
+        matrix: (n, p) columns of the terms, less the same means.
+        columns: (p,) number of each column in the design.
+        terms: terms that are tested here.
         groups: (n / width,) group of each unit; units of a group are exchangeable.
         removed: number of means removed.
-        number: of the stratum, for its seed.
+        number: number of the stratum, for its seed.
         nuisance: terms that are in the model but not tested here.
-        scheme: how units are arranged.
+        scheme: arrangement of the units.
         width: consecutive rows of one unit, which stay together.
         units: (n / width,) index of each unit among those for which arrangements are drawn; None if they are the same.
         n_units: number of units for which arrangements are drawn.
-        constant: (n,) the row of the constant in the first row of each unit; None where means are removed.
+        constant: (n,) the row of the constant in the first row of each unit; None if means are removed.
     """
 
     name: str
@@ -79,7 +79,7 @@ class Stratum:
 
     @cached_property
     def basis(self) -> FloatArray:
-        """(n, p) orthonormal columns of the whole model."""
+        """(n, p) orthonormal columns of the full model."""
         return np.linalg.qr(self.matrix)[0]
 
     def fewest_log_arrangements(self, *, flips: bool = False) -> float:
@@ -102,7 +102,7 @@ class Stratum:
         return float(sum(math.lgamma(n + 1) for n in every) - sum(math.lgamma(n + 1) for n in alike))
 
     def columns_of(self, terms: Sequence[Term]) -> Rows:
-        """Return the columns of `matrix` that some terms have."""
+        """Return the columns of `matrix` that belong to some terms."""
         wanted = [column for term in terms for column in term.columns]
         return np.flatnonzero(np.isin(self.columns, wanted))
 
@@ -114,7 +114,7 @@ class Stratum:
         return others if squares == "III" else [other for other in others if not term.factors < other.factors]
 
     def without(self, variables: frozenset[str]) -> list[Term]:
-        """Return the terms that do not contain all of some variables, by their names inside."""
+        """Return the terms that do not contain all of some variables, by their internal names."""
         return [term for term in (*self.nuisance, *self.terms) if not variables <= term.variables]
 
     def residual(self, terms: Sequence[Term]) -> FloatArray:
@@ -122,7 +122,7 @@ class Stratum:
         return less(self.shapes, self.matrix[:, self.columns_of(terms)])
 
     def direction(self, contrast: FloatArray) -> FloatArray:
-        """Return (n,) what gives the estimate of a contrast (P,) of the design when multiplied by the shapes (S6)."""
+        """Return (n,) weights of the shapes whose weighted sum estimates a contrast (P,) of the design (S6)."""
         own = np.zeros(len(self.columns))
         tested = self.columns_of(self.terms)
         own[tested] = contrast[self.columns[tested]]
@@ -137,15 +137,15 @@ class Stratum:
     def unit_products(
         self, basis: FloatArray, reduced: Sequence[Term], error: Term, permutations: int, seed: int, ratio: float
     ) -> FloatArray:
-        """Return products as `products`, where the mean residuals of the units of an error term are permuted.
+        """Return the same as `products`, but with the mean residuals of the units of an error term permuted.
 
         Args:
-            basis: (n, m), orthogonal to the reduced model.
+            basis: (n, m) columns, orthogonal to the reduced model.
             reduced: terms of the reduced model.
-            error: whose classes are the units.
+            error: error term whose classes are the units.
             permutations: number of permutations, including the observed data.
-            seed: of these.
-            ratio: variance between units divided by that within, by which means are standardised before.
+            seed: seed of the permutations.
+            ratio: variance between units divided by that within units, by which means are standardised first.
         """
         units, residual = self.error_units(error), self.residual(reduced)
         means = means_of(residual, units)
@@ -227,7 +227,7 @@ def less(shapes: FloatArray, columns: FloatArray) -> FloatArray:
 
 
 def span(columns: FloatArray, rank: int | None = None) -> FloatArray:
-    """Return orthonormal columns (n, r) that span those given."""
+    """Return orthonormal columns (n, r) that span the same space as `columns`."""
     u, s, _ = np.linalg.svd(columns, full_matrices=False)
     return u[:, : int((s > RANK * max(float(s.max(initial=0.0)), 1e-300)).sum()) if rank is None else rank]
 
@@ -240,8 +240,8 @@ def independent_stratum(shapes: FloatArray, design: Design) -> Stratum:
     """
     n = len(shapes)
     everything, columns = independent_columns(design.matrix - design.matrix.mean(axis=0), design.terms)
-    refuse_few(n - 1, design, "", n, "shapes", len(columns))
-    refuse_aliased(everything, columns, design.terms, design)
+    check_error_freedom(n - 1, design, "", n, "shapes", len(columns))
+    check_not_aliased(everything, columns, design.terms, design)
     rows = np.zeros(n, dtype=np.intp)
     return Stratum(
         name="",
@@ -261,16 +261,17 @@ def between_stratum(
 ) -> Stratum:  # fmt: skip
     """Return the stratum of means of subjects.
 
-    Subjects whose scans are of other conditions than those of the rest also differ by these. The subjects' means of the
-    columns of the conditions are covariates of the same model, so that its F contains the uncertainty of their slopes.
+    Subjects whose scans are of other conditions than those of the rest also differ by these conditions. The subjects'
+    means of the columns of the conditions are covariates of the same model, so that F contains the uncertainty of their
+    slopes.
 
     Args:
-        means: (S, K) mm, of the cells of subjects.
-        matrix: (S, P) of the design, in a row of each subject.
+        means: (S, K) means of the cells of each subject, mm.
+        matrix: (S, P) row of the design for each subject.
         conditions: terms within subjects, each with its columns (S, m) less those of the usual condition.
-        design: of the model.
-        terms: that are the same in all cells of a subject.
-        blocks: what a subject is called, in messages.
+        design: columns of the model.
+        terms: terms that are the same in all cells of a subject.
+        blocks: name of a subject in messages.
 
     Raises:
         InputError: more columns than subjects, or a term that follows from the others or from the conditions.
@@ -278,8 +279,8 @@ def between_stratum(
     where = f"between {blocks}"
     covariates, own = independent_columns(matrix - matrix.mean(axis=0), terms)
     n = len(means)
-    refuse_few(n - 1, design, where, n, "blocks", len(own))
-    refuse_aliased(covariates, own, terms, design, where)
+    check_error_freedom(n - 1, design, where, n, "blocks", len(own))
+    check_not_aliased(covariates, own, terms, design, where)
     # A condition that is the same for all subjects, or follows from others, adds nothing.
     known = np.empty((n, 0))
     nuisance, adjusted = list[Term](), list[FloatArray]()
@@ -298,7 +299,7 @@ def between_stratum(
         if n - 1 - len(own) - len(adjusted) < 1:
             raise InputError(
                 f"{design.formula!r} has {len(own)} columns {where} and {len(adjusted)} for unequal {labels} of the "
-                f"{n} blocks, too many; leave out terms, or shapes so that each {blocks} has the same conditions."
+                f"{n} blocks, too many; remove terms, or exclude shapes so that each {blocks} has the same conditions."
             )
         for term in terms:
             values = covariates[:, np.isin(own, term.columns)]
@@ -306,11 +307,11 @@ def between_stratum(
             if (np.linalg.norm(less(values, known), axis=0) <= _ALIASED * lengths).any():
                 raise InputError(
                     f"In {design.formula!r} {term.label} follows from {labels} {where}, so the effects of groups and "
-                    "conditions cannot be separated; leave out one of them."
+                    "conditions cannot be separated; remove a term."
                 )
     model = np.column_stack([covariates, *adjusted])
     ids = np.array([*own, *range(matrix.shape[1], matrix.shape[1] + len(adjusted))], dtype=np.intp)
-    refuse_aliased(model, ids, (*nuisance, *terms), design, where)
+    check_not_aliased(model, ids, (*nuisance, *terms), design, where)
     rows = np.zeros(n, dtype=np.intp)
     return Stratum(
         name=where,
@@ -351,13 +352,13 @@ def common_stratum(
     """Return the stratum of cells within subjects, for effects that are assumed to be the same in all subjects.
 
     Args:
-        shapes: (C, K) mm, of the cells of subjects.
-        matrix: (C, P) of the design.
+        shapes: (C, K) shapes of the cells of subjects, mm.
+        matrix: (C, P) rows of the design.
         own_columns: (C, q) columns whose slopes, in addition to the mean, differ between subjects.
         subject_of_cell: (C,) subject of each cell, from 0.
-        design: of the model.
-        terms: of these effects.
-        blocks: what a subject is called, in messages.
+        design: columns of the model.
+        terms: terms of these effects.
+        blocks: name of a subject in messages.
 
     Raises:
         InputError: more columns than rows, or a term that follows from the others.
@@ -368,9 +369,9 @@ def common_stratum(
     where = f"within {blocks}"
     if not own_columns.shape[1]:
         subjects = int(subject_of_cell.max()) + 1
-        refuse_few(n - subjects, design, where, n, f"shapes in {subjects} blocks", len(columns))
+        check_error_freedom(n - subjects, design, where, n, f"shapes in {subjects} blocks", len(columns))
         inner = values - means_of(values, subject_of_cell)[subject_of_cell]
-        refuse_aliased(inner, columns, terms, design, where)
+        check_not_aliased(inner, columns, terms, design, where)
         return Stratum(
             name=where,
             shapes=shapes - means_of(shapes, subject_of_cell)[subject_of_cell],
@@ -390,8 +391,8 @@ def common_stratum(
         rows.append(free @ shapes[cells])
         inner.append(free @ values[cells])
     rest, model = np.concatenate(rows), np.concatenate(inner)
-    refuse_few(len(rest), design, where, len(rest), f"differences of shapes of one {blocks}", len(columns))
-    refuse_aliased(model, columns, terms, design, where, np.abs(values).max(axis=0))
+    check_error_freedom(len(rest), design, where, len(rest), f"differences of shapes of one {blocks}", len(columns))
+    check_not_aliased(model, columns, terms, design, where, np.abs(values).max(axis=0))
     groups = np.zeros(len(rest), dtype=np.intp)
     return Stratum(
         name=where,
@@ -407,7 +408,7 @@ def common_stratum(
 
 
 def columns_of_terms(terms: Sequence[Term]) -> Rows:
-    """Return the columns of the design that terms have, in order."""
+    """Return the columns of the design that belong to terms, in order."""
     return np.array(sorted(column for term in terms for column in term.columns), dtype=np.intp)
 
 
@@ -421,7 +422,7 @@ def independent_columns(matrix: FloatArray, terms: Sequence[Term]) -> tuple[Floa
     """Return the columns of terms with their numbers in the design (n, P); those of nested terms are independent.
 
     A nested term has columns for combinations that do not exist, such as a species in another genus. They are replaced
-    by an orthonormal basis of what the term adds to the terms that it contains.
+    by an orthonormal basis of the space that the term adds to the terms that it contains.
     """
     matrix, columns = matrix.copy(), list[int]()
     for term in terms:
@@ -439,42 +440,42 @@ def independent_columns(matrix: FloatArray, terms: Sequence[Term]) -> tuple[Floa
 
 
 def means_of(rows: FloatArray, group: Rows) -> FloatArray:
-    """Return the mean of the rows of each group, whose numbers `at` (n,) count from 0."""
+    """Return the mean of the rows of each group, for group numbers `group` (n,) that count from 0."""
     order = np.argsort(group, kind="stable")
     counts = np.bincount(group)
     return np.add.reduceat(rows[order], np.cumsum(counts) - counts, axis=0) / counts[:, None]
 
 
-def refuse_few(free: int, design: Design, where: str, count: int, unit: str, columns: int) -> None:
+def check_error_freedom(free: int, design: Design, where: str, count: int, unit: str, columns: int) -> None:
     """Check that a model leaves degrees of freedom for its error.
 
     Raises:
-        InputError: it has as many columns as rows that are free, or more.
+        InputError: the model has at least as many columns as free rows.
     """
     if free - columns < 1:
         where_text = f" {where}" if where else ""
         raise InputError(
             f"{design.formula!r} has {columns} column{'s' * (columns != 1)}{where_text} for {count} {unit}, so that "
-            "no degrees of freedom are left for the error; leave out terms or classes, or add shapes."
+            "no degrees of freedom are left for the error; remove terms or classes, or add shapes."
         )
 
 
-def refuse_aliased(
+def check_not_aliased(
     matrix: FloatArray, columns: Rows, terms: Sequence[Term], design: Design, where: str = "",
     scale: FloatArray | None = None,
 ) -> None:  # fmt: skip
     """Check that no column follows from those before it, in the order of `terms`.
 
     Args:
-        matrix: (n, p).
-        columns: (p,) of the design.
-        terms: whose columns they are.
-        design: of the model.
-        where: the stratum, in messages.
-        scale: (p,) values that count as zero if they are far below; None takes those of the columns.
+        matrix: (n, p) columns of the model.
+        columns: (p,) number of each column in the design.
+        terms: terms to which the columns belong.
+        design: columns of the model with its formula.
+        where: name of the stratum, for messages.
+        scale: (p,) scale of each column, far below which it counts as zero (default: the length of the column).
 
     Raises:
-        InputError: one does.
+        InputError: a column follows from others.
     """
     known = np.empty((len(matrix), 0))
     for term in terms:
@@ -487,7 +488,6 @@ def refuse_aliased(
                 where_text = f" {where}" if where else ""
                 raise InputError(
                     f"In {design.formula!r} {term.label} follows from the other terms{where_text}, or has an empty "
-                    "group; "
-                    "leave out one of them."
+                    "group; remove a term."
                 )
             known = np.column_stack([known, rest / np.linalg.norm(rest)])

@@ -20,12 +20,12 @@ from shapespace.statistics.compare_strata import (
     Rows,
     Stratum,
     between_stratum,
+    check_not_aliased,
     columns_of_terms,
     common_stratum,
     independent_columns,
     independent_stratum,
     means_of,
-    refuse_aliased,
 )
 from shapespace.types import FloatArray
 
@@ -40,9 +40,10 @@ class SubjectResponses:
     """An effect within subjects, estimated for each subject that shows it.
 
     Args:
-        subjects: (s,) which subjects these are.
-        values: (s, d, K) mm; d orthonormal contrasts.
-        variances: (s,) of the estimates for unit variance of the cells, mean of the contrasts, divided by their median.
+        subjects: (s,) numbers of the subjects.
+        values: (s, d, K) responses in d orthonormal contrasts, mm.
+        variances: (s,) variances of the estimates for unit variance of the cells, mean of the contrasts, divided by
+            their median.
     """
 
     subjects: Rows
@@ -55,12 +56,12 @@ class WithinSubjects:
     """The cells of subjects, and the effects that differ within subjects.
 
     Args:
-        design: of the whole model.
-        blocks: what a subject is called, in messages.
+        design: columns of the full model.
+        blocks: name of a subject in messages.
         effects: columns of these effects, one term each, after the constant; for the rows of the table.
-        terms: of the whole model that contain an effect, by the number of the effect among the terms of `effects`.
+        terms: number of an effect among the terms of `effects` -> terms of the full model that contain it.
         random: numbers of the effects that differ between subjects.
-        shapes: (C, K) mm, means of the shapes of each cell.
+        shapes: (C, K) means of the shapes of each cell, mm.
         rows: (C,) a row of the table in each cell.
         subject_of_cell: (C,) subject of each cell, from 0.
     """
@@ -84,7 +85,7 @@ class WithinSubjects:
         return self.effects.terms[effect].label
 
     def strata(self, squares: str) -> tuple[Stratum, ...]:
-        """Return the strata within subjects: of each effect that differs between subjects, and of all others together.
+        """Return the strata within subjects: one of each effect that differs between subjects, and one of all others.
 
         Raises:
             InputError: an effect that too few subjects show, or terms that follow from others.
@@ -114,13 +115,15 @@ class WithinSubjects:
         return tuple(strata)
 
     def conditions(self) -> Iterator[tuple[Term, FloatArray]]:
-        """Yield the terms within subjects with the subjects' means of their columns, less those of most subjects.
+        """Yield the terms within subjects with the subjects' means of their columns, less the median over subjects.
 
-        The median is the balanced condition where most subjects have it, so that theirs needs no adjustment.
+        The median is the balanced condition if most subjects have it, so that these need no adjustment.
         """
         means = means_of(self.effects.matrix[self.rows], self.subject_of_cell)
         means = means - np.median(means, axis=0)
-        first = np.array([self.rows[np.flatnonzero(self.subject_of_cell == one)[0]] for one in range(self.count)])
+        first = np.array(
+            [self.rows[np.flatnonzero(self.subject_of_cell == subject)[0]] for subject in range(self.count)]
+        )
         scale = self.effects.matrix.std(axis=0)
         for effect, terms in self.terms.items():
             columns = list(self.effects.terms[effect].columns)
@@ -132,7 +135,7 @@ class WithinSubjects:
                 yield term, (own[:, :, None] * between[:, None, :]).reshape(self.count, -1)
 
     def holds(self, variables: frozenset[str]) -> bool:
-        """Return whether the joint effect of variables, by their names inside, may differ between subjects."""
+        """Return whether the joint effect of variables, by their internal names, may differ between subjects."""
         own = variables & self.variables
         return bool(own) and any(own <= self.effects.terms[effect].variables for effect in self.random)
 
@@ -143,7 +146,7 @@ class WithinSubjects:
 
     @property
     def variables(self) -> frozenset[str]:
-        """Names inside of the variables that differ within subjects."""
+        """Internal names of the variables that differ within subjects."""
         return frozenset(name for term in self.effects.terms for name in term.variables)
 
     def common_effects(self) -> tuple[str, ...]:
@@ -151,7 +154,7 @@ class WithinSubjects:
         return tuple(self.label(effect) for effect in self.terms if effect not in self.random)
 
     def subjects_without_effect(self, strata: Sequence[Stratum]) -> dict[str, int]:
-        """Return effect -> number of subjects from whose conditions it cannot be estimated."""
+        """Return effect -> number of subjects whose conditions do not determine it."""
         return {
             stratum.name.removeprefix(f"within {self.blocks}: "): self.count - len(stratum.groups)
             for stratum in strata
@@ -162,12 +165,12 @@ class WithinSubjects:
         """Return the stratum of one contrast of the conditions within subjects, and its columns between subjects.
 
         Args:
-            contrast: (D,) of the columns of `effects`.
+            contrast: (D,) weights of the columns of `effects`.
             variables: internal names of its variables within subjects.
             name: name of the contrast, for messages.
 
         Raises:
-            InputError: too few subjects show it.
+            InputError: too few subjects show the contrast.
         """
         every = range(1, len(self.effects.terms))
         chosen = tuple(effect for effect in every if variables <= self.effects.terms[effect].variables)
@@ -180,20 +183,20 @@ class WithinSubjects:
         label = where.removeprefix(f"within {self.blocks}: ")
         if not s:
             raise InputError(
-                f"In {self.design.formula!r} no {self.blocks} has shapes in all conditions that {label} needs; leave "
-                "it out, or leave out classes with few shapes."
+                f"In {self.design.formula!r} no {self.blocks} has shapes in all conditions that {label} needs; remove "
+                "it, or exclude classes with few shapes."
             )
-        terms, between = self._between(effects)
-        first = np.array([np.flatnonzero(self.subject_of_cell == one)[0] for one in responses.subjects])
+        terms, between = self._between_design(effects)
+        first = np.array([np.flatnonzero(self.subject_of_cell == subject)[0] for subject in responses.subjects])
         matrix = between.matrix[self.rows[first]]
         if s - matrix.shape[1] < 1:
             raise InputError(
                 f"In {self.design.formula!r} only {s} of {self.count} blocks have shapes in the conditions that "
-                f"{label} needs, too few for {matrix.shape[1]} columns between them; leave it out, or classes that few "
-                "have."
+                f"{label} needs, too few for {matrix.shape[1]} columns between them; remove it, or exclude "
+                "classes with few shapes."
             )
         columns = np.arange(matrix.shape[1], dtype=np.intp)
-        refuse_aliased(matrix, columns, terms, self.design, where)
+        check_not_aliased(matrix, columns, terms, self.design, where)
         roots = np.sqrt(_weights(responses, matrix))
         weighted = roots[:, None] * matrix
         expanded: FloatArray = np.kron(weighted, np.eye(d)).astype(np.float64)
@@ -216,7 +219,7 @@ class WithinSubjects:
         )
         return stratum, between
 
-    def _between(self, effects: Sequence[int]) -> tuple[tuple[Term, ...], Design]:
+    def _between_design(self, effects: Sequence[int]) -> tuple[tuple[Term, ...], Design]:
         """Return the terms that contain some effects, and the design of their parts between subjects."""
         chosen = [term for effect in effects for term in self.terms[effect]]
         chosen.sort(key=self.design.terms.index)
@@ -227,7 +230,7 @@ class WithinSubjects:
         return tuple({term.columns: term for term in terms}.values()), made
 
     def _responses(self, target: FloatArray, model: Sequence[int], *, in_mm: bool = False) -> SubjectResponses:
-        """Return contrasts `target` (D, d) of the columns of the effects, each subject's in its model of some effects.
+        """Return contrasts `target` (D, d) of the columns of the effects, in each subject's model of the effects.
 
         They are scaled so that their squares are those of the cells of an average subject, or in mm (`in_mm`).
         """
@@ -247,10 +250,10 @@ class WithinSubjects:
             covariances.append(covariance)
         if not chosen:
             return SubjectResponses(np.zeros(0, dtype=np.intp), np.zeros((0, target.shape[1], 0)), np.zeros(0))
-        information = sum(np.linalg.inv(one) for one in covariances) / len(covariances)
+        information = sum(np.linalg.inv(covariance) for covariance in covariances) / len(covariances)
         metric = np.asarray(np.linalg.cholesky(information), dtype=np.float64)
-        own = np.array([np.trace(metric.T @ one @ metric) for one in covariances]) / target.shape[1]
-        responses = np.stack(estimates) if in_mm else np.stack([metric.T @ one for one in estimates])
+        own = np.array([np.trace(metric.T @ covariance @ metric) for covariance in covariances]) / target.shape[1]
+        responses = np.stack(estimates) if in_mm else np.stack([metric.T @ estimate for estimate in estimates])
         return SubjectResponses(np.array(chosen, dtype=np.intp), responses, own / np.median(own))
 
 
@@ -284,7 +287,7 @@ def _weights(responses: SubjectResponses, matrix: FloatArray) -> FloatArray:
 def _estimate(values: FloatArray, wanted: FloatArray) -> tuple[FloatArray | None, FloatArray | None]:
     """Return the weights (d, c) of centred cells (c, D) that estimate contrasts (D, d), and their products (d, d).
 
-    None where the cells do not determine all of the contrasts.
+    None if the cells do not determine all contrasts.
     """
     u, s, vt = np.linalg.svd(values, full_matrices=False)
     seen = s > _ESTIMABLE * np.sqrt(len(values))
@@ -297,21 +300,21 @@ def _estimate(values: FloatArray, wanted: FloatArray) -> tuple[FloatArray | None
 
 
 def _reduced_effects(effects: Sequence[Term], effect: int, squares: str) -> list[int]:
-    """Return the other effects in the model with which one is estimated, for a type of sums of squares."""
-    others = range(1, effect) if squares == "I" else [one for one in range(1, len(effects)) if one != effect]
-    return [one for one in others if squares != "II" or not effects[effect].factors < effects[one].factors]
+    """Return the other effects in the model that estimates an effect, for a type of sums of squares."""
+    others = range(1, effect) if squares == "I" else [other for other in range(1, len(effects)) if other != effect]
+    return [other for other in others if squares != "II" or not effects[effect].factors < effects[other].factors]
 
 
 @dataclass(frozen=True, kw_only=True)
 class RepeatedMeasures:
-    """How several shapes of a subject enter the tests.
+    """Use of several shapes of a subject in the tests.
 
     Args:
         n_cells: cells of one subject and condition, to which the shapes are averaged.
         random_effects: effects within subjects that may differ between subjects.
         common_effects: effects within subjects that are assumed to be the same in all subjects.
-        subjects_without_effect: effect -> number of subjects that lack the conditions from which it is estimated; they
-            are excluded from its test.
+        subjects_without_effect: effect -> number of subjects without the conditions that determine it; they are
+            excluded from its test.
         adjusted_conditions: terms within subjects whose subject means are covariates of the model between subjects.
     """
 
@@ -327,9 +330,9 @@ class ModelStrata:
     """The strata of a model.
 
     Args:
-        every: with the terms that are tested in each.
-        within: the effects within subjects; None where there are none.
-        repeated_measures: how several shapes of a subject enter the tests; None where all rows are exchangeable.
+        every: strata, each with the terms that are tested in it.
+        within: effects within subjects; None without effects within subjects.
+        repeated_measures: use of several shapes of a subject in the tests; None if all rows are exchangeable.
     """
 
     every: tuple[Stratum, ...]
@@ -344,25 +347,27 @@ def strata_of(
     """Return the strata of a linear model of shapes.
 
     Args:
-        shapes: (N, K) mm.
-        design: of N rows.
-        subjects: N, whose scans the rows are; None where all rows are exchangeable.
-        blocks: what a subject is called, in messages.
+        shapes: (N, K) shapes, mm.
+        design: columns of the model, with N rows.
+        subjects: (N,) subject of each row; None if all rows are exchangeable.
+        blocks: name of a subject in messages.
         squares: type of sums of squares.
         random: effects within subjects that differ between subjects, as products of factors; None for all.
 
     Raises:
         InputError: one subject, more columns than rows, a term that follows from the others, an effect that too few
-            subjects show, or random effects that are none of the model.
+            subjects show, or random effects that are not in the model.
     """
     if subjects is None:
         return ModelStrata((independent_stratum(shapes, design),))
     n = len(shapes)
-    refuse_aliased(*independent_columns(design.matrix - design.matrix.mean(axis=0), design.terms), design.terms, design)
+    check_not_aliased(
+        *independent_columns(design.matrix - design.matrix.mean(axis=0), design.terms), design.terms, design
+    )
     names, who = np.unique(np.asarray(subjects), return_inverse=True)
     if len(names) == 1:
         raise InputError(f"All {n} shapes are of one {blocks}, {names[0]}; a comparison needs several.")
-    varying = {one.column for one in design.variables if _varies(design.values[one.column], who)}
+    varying = {variable.column for variable in design.variables if _varies(design.values[variable.column], who)}
     rows, cell = _cells(design, who, varying)
     subject_of_cell = who[rows]
     means = means_of(shapes, cell)
@@ -371,7 +376,7 @@ def strata_of(
     strata: list[Stratum] = []
     within = None
     if inner:
-        within = _within(
+        within = _within_subjects(
             design=design,
             inner=inner,
             varying=varying,
@@ -383,9 +388,9 @@ def strata_of(
         )
         strata += within.strata(squares)
     elif random:
-        raise _no_effect(random[0], design)
+        raise _no_effect_error(random[0], design)
     if outer:
-        first = np.array([np.flatnonzero(subject_of_cell == one)[0] for one in range(len(names))])
+        first = np.array([np.flatnonzero(subject_of_cell == subject)[0] for subject in range(len(names))])
         conditions = () if within is None else tuple(within.conditions())
         strata.insert(
             0,
@@ -403,13 +408,13 @@ def strata_of(
     return ModelStrata(tuple(strata), within, repeated_measures)
 
 
-def _within(
+def _within_subjects(
     design: Design, inner: Sequence[Term], varying: set[str], blocks: str, random: Sequence[frozenset[str]] | None,
     shapes: FloatArray, rows: Rows, subject_of_cell: Rows,
 ) -> WithinSubjects:  # fmt: skip
     factors = {name for name, variable in design.factors.items() if variable in varying}
     effects = list(dict.fromkeys(term.factors & factors for term in inner))
-    # Subjects of different classes may differ in their mean, which belongs between them.
+    # Subjects of different classes may differ in their mean, which is a term between subjects.
     for term in inner:
         between = term.factors - factors
         if between and not any(other.factors == between for other in design.terms):
@@ -419,10 +424,10 @@ def _within(
             )
     chosen = list(range(1, len(effects) + 1))
     if random is not None:
-        for one in random:
-            if one not in effects:
-                raise _no_effect(one, design)
-        chosen = [1 + effects.index(one) for one in effects if one in random]
+        for effect in random:
+            if effect not in effects:
+                raise _no_effect_error(effect, design)
+        chosen = [1 + effects.index(effect) for effect in effects if effect in random]
     terms = {
         number: tuple(term for term in inner if term.factors & factors == effect)
         for number, effect in enumerate(effects, 1)
@@ -439,7 +444,7 @@ def _within(
     )
 
 
-def _no_effect(effect: frozenset[str], design: Design) -> InputError:
+def _no_effect_error(effect: frozenset[str], design: Design) -> InputError:
     return InputError(
         f"The random term {':'.join(sorted(effect))} is no effect within subjects of {design.formula!r}; write terms "
         "of the formula that differ within subjects."

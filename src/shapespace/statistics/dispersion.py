@@ -33,7 +33,7 @@ Codes: TypeAlias = npt.NDArray[np.intp]
 
 Variances: TypeAlias = Literal["auto", "equal", "unequal"]
 VARIANCES: tuple[Variances, ...] = ("auto", "equal", "unequal")
-"""Of the classes, in tests of means."""
+"""Assumptions on the variances of the classes, in tests of means."""
 
 FEWEST_OF_GROUP = 3
 """Smallest class for which the level of tests with unequal variances was measured (docs/compare.md)."""
@@ -51,7 +51,7 @@ _FORM_STREAM = 5  # separates the permutations of the test of form from those of
 _DOUBTFUL = (0.3, 0.1)
 """p of dispersion and of form below which classes of different size are not assumed to be alike (docs/compare.md)."""
 _UNEQUAL = (0.05, 0.05)
-"""The same for classes of one size, for which permutation is nearly correct."""
+"""The same limits for classes of one size, for which permutation is nearly correct."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,12 +62,12 @@ class DispersionTest:
         variable: name of the variable.
         stratum: name of the stratum; empty if there is only one.
         groups: classes with two or more members.
-        counts: members of each.
+        counts: number of members of each class.
         stddev_mm: standard deviation of the shapes of each class about their mean, RMS over the vertices.
         f: F of the distances to the group mean.
         p: share of permutations of the distances with an F at least as large.
-        p_form: the same of a test whether covariances are proportional; 1 if a class has fewer than two contrasts.
-        permutations: number of them, the observed one among them.
+        p_form: p of a test whether covariances are proportional; 1 if a class has fewer than two contrasts.
+        permutations: number of permutations, the observed one among them.
     """
 
     variable: str
@@ -114,13 +114,13 @@ def dispersion_test(
 
     Args:
         variable: name of the variable.
-        shapes: (n, K) mm.
-        full: (n, m) orthonormal columns of the whole model, the mean among them.
+        shapes: (n, K) shapes, mm.
+        full: (n, m) orthonormal columns of the full model, the mean among them.
         codes: (n,) class of each row.
         groups: names of the classes.
-        n_vertices: of the shapes, for the root mean square.
-        permutations: the observed one among them.
-        seed: of these.
+        n_vertices: number of vertices of the shapes, for the root mean square.
+        permutations: number of permutations, the observed one among them.
+        seed: seed of the permutations.
         stratum: name of the stratum.
 
     Returns:
@@ -168,9 +168,9 @@ def _form_p(contrasts: Sequence[FloatArray], permutations: int, seed: int) -> fl
     trace, estimated without bias by the squared products of different contrasts.
 
     Args:
-        contrasts: (f, K) of each class, mm.
+        contrasts: (f, K) contrasts of each class, mm.
         permutations: number of permutations of the contrasts between classes, the observed one among them.
-        seed: of these.
+        seed: seed of the permutations.
     """
     counts = np.array([len(own) for own in contrasts])
     squares = [float((own**2).sum()) for own in contrasts]
@@ -203,16 +203,16 @@ def _f_of_means(values: FloatArray, codes: Codes) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class UnequalVariances:
-    """Sign flips of the residuals of a reduced model, and the variance of an estimate in each of them.
+    """Sign flips of the residuals of a reduced model, and the variance of an estimate in each sign flip.
 
     Args:
-        full: (n, m) orthonormal columns of the whole model, the mean among them where it was removed.
-        residual: (n, K) mm, of the reduced model by weighted least squares.
+        full: (n, m) orthonormal columns of the full model, the mean among them if it was removed.
+        residual: (n, K) residuals of the reduced model by weighted least squares, mm.
         scale: (n,) correction of residuals for their leverage.
-        leverage: (n,) diagonal of the hat matrix of the whole model.
+        leverage: (n,) diagonal of the hat matrix of the full model.
         rotated: rows of each class whose residuals are rotated; the signs of all others are flipped.
         permutations: number of sign flips, the observed data among them.
-        seed: of these.
+        seed: seed of the sign flips.
     """
 
     full: FloatArray
@@ -262,8 +262,8 @@ class Estimate:
 
     Args:
         flips: sign flips of the residuals of the reduced model.
-        along: (q, m) the estimate in the columns of `full`.
-        weights: (n,) with which the squared residual of each row adds to its variance.
+        along: (q, m) direction of the estimate in the columns of `full`.
+        weights: (n,) weight of the squared residual of each row in the variance of the estimate.
     """
 
     flips: UnequalVariances
@@ -294,16 +294,16 @@ class Estimate:
         """Return the (stop - start, v) statistics of v vertices in a part of the sign flips.
 
         Args:
-            columns: (K, v width) from coefficients to values of the vertices.
+            columns: (K, v width) matrix from coefficients to values of the vertices.
             width: number of values per vertex.
-            start: of the sign flips.
-            stop: of the sign flips.
+            start: first sign flip.
+            stop: end of the sign flips, exclusive.
         """
         fitted, weighted = (part[start:stop] @ columns for part in (self.flips.fitted, self._weighted))
-        squares = _of_vertices((self.flips.residual @ columns) ** 2, width)
-        explained = _of_vertices(((self.along @ fitted) ** 2).sum(axis=1), width)
+        squares = _sum_per_vertex((self.flips.residual @ columns) ** 2, width)
+        explained = _sum_per_vertex(((self.along @ fitted) ** 2).sum(axis=1), width)
         variance = self._squares(squares, start, stop)
-        variance += _of_vertices(((self._between @ fitted - 2.0 * weighted) * fitted).sum(axis=1), width)
+        variance += _sum_per_vertex(((self._between @ fitted - 2.0 * weighted) * fitted).sum(axis=1), width)
         return explained / np.maximum(variance, _FLOOR * (self.weights @ squares) + 1e-300)
 
     def _squares(self, squares: FloatArray, start: int, stop: int) -> FloatArray:
@@ -315,7 +315,7 @@ class Estimate:
         return out
 
 
-def _of_vertices(values: FloatArray, width: int) -> FloatArray:
+def _sum_per_vertex(values: FloatArray, width: int) -> FloatArray:
     return values.reshape(len(values), -1, width).sum(axis=2)
 
 
@@ -331,12 +331,12 @@ def unequal_variances(
     """Return the sign flips with which a term of a linear model is tested.
 
     Args:
-        shapes: (n, K) mm.
-        full: (n, m) orthonormal columns of the whole model, the mean among them.
-        reduced: (n, r) orthonormal columns of the model without what is tested; r may be 0.
+        shapes: (n, K) shapes, mm.
+        full: (n, m) orthonormal columns of the full model, the mean among them.
+        reduced: (n, r) orthonormal columns of the model without the tested terms; r may be 0.
         groups: (n,) class of each row; variances may differ between classes. None for equal weights.
         permutations: number of sign flips, the observed data among them.
-        seed: of these.
+        seed: seed of the sign flips.
         where: name of the term, for messages.
 
     Raises:
@@ -346,7 +346,7 @@ def unequal_variances(
     if float(leverage.max()) > 1.0 - FULL_LEVERAGE:
         raise InputError(
             f"Unequal variances of {where}: {int((leverage > 1 - FULL_LEVERAGE).sum())} of {len(shapes)} subjects "
-            "are fitted exactly, as the only member of a class is, so their variance is unknown; leave them out, or "
+            "are fitted exactly, as the only member of a class is, so their variance is unknown; exclude them, or "
             "merge their classes."
         )
     weights, rotated = np.ones(len(shapes)), list[Codes]()
@@ -362,8 +362,8 @@ def unequal_variances(
 def _class_weights(squares: FloatArray, leverage: FloatArray, groups: Codes) -> FloatArray:
     """Return the weights (n,) of rows by the inverse variance of their class, from squared residuals (n,).
 
-    A class of f degrees of freedom has f - 1 without the row whose residual is flipped. Weights by all of them would
-    pull the common mean, and so the null distribution, towards small classes.
+    A class of f degrees of freedom has f - 1 without the row whose residual is flipped. Weights by all f would pull the
+    common mean, and so the null distribution, towards small classes.
     """
     free = np.maximum(np.bincount(groups, weights=1.0 - leverage), FULL_LEVERAGE)
     variances = np.bincount(groups, weights=squares) / free
@@ -383,18 +383,19 @@ def weighted_residual(shapes: FloatArray, columns: FloatArray, weights: FloatArr
 def welch_flips(
     maps: FloatArray, second: npt.NDArray[np.bool_], area: FloatArray, permutations: int, seed: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return Welch's t (V,) of two groups, its largest |t| and that of the whole difference in each sign flip.
+    """Return Welch's t (V,) of two groups, and in each sign flip its largest |t| and that of the overall difference.
 
     Args:
-        maps: (N, V) of the subjects; each group has two or more.
+        maps: (N, V) values of the subjects; each group has two or more subjects.
         second: (N,) whether a subject is of the second group.
         area: (V,) weights of the vertices in the squared difference.
         permutations: number of sign flips, the observed data among them.
         seed: seed of the sign flips.
 
     Returns:
-        t: (V,) as observed.
-        arrangements: (2, P) the largest |t|, and the whole difference by its standard error; the observed ones first.
+        t: (V,) observed t.
+        arrangements: (2, P) the largest |t|, and the overall difference divided by its standard error; observed ones
+            first.
     """
     members = np.column_stack([~second, second]).astype(np.float64)
     full = members / np.sqrt(members.sum(axis=0))

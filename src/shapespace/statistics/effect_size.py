@@ -37,7 +37,7 @@ def effect_size(statistic: FloatArray, kind: EffectSize = "box-cox") -> float:
         kind: `box-cox` estimates the exponent from the permutations without the observed value; `log` takes logarithms.
 
     Returns:
-        Z; 0 where all statistics are the same.
+        Z; 0 if all statistics are the same.
     """
     values = np.maximum(np.asarray(statistic, dtype=np.float64), _SMALLEST)
     logs = np.log(values)

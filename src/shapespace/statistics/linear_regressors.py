@@ -18,20 +18,20 @@ from shapespace.types import FloatArray
 
 IndexArray = npt.NDArray[np.intp]
 PENALTIES = tuple(10.0 ** (0.5 * k) for k in range(-10, 1))
-"""Of ridge regression on coefficients, times the largest squared singular value."""
+"""Penalties of ridge regression on coefficients, as shares of the largest squared singular value."""
 MODES = (1, 2, 3, 5, 8, 12, 20, 30, 50)
-"""Leading principal components that a regression on whitened coefficients keeps."""
+"""Numbers of leading principal components in a regression on whitened coefficients."""
 _NOTHING = 1e-10  # share of the first singular value; below is rounding
 
 
 @dataclass(frozen=True)
 class Regularisation:
-    """How much of the shapes a regression goes by.
+    """Regularisation of a regression on shapes.
 
     Args:
         space: `raw` for ridge regression on coefficients, `whitened` for least squares on the leading principal
-            components, which then count alike.
-        amount: the penalty times the largest squared singular value, or the number of components.
+            components, which then have equal weights.
+        amount: penalty divided by the largest squared singular value, or the number of components.
     """
 
     space: str
@@ -44,7 +44,7 @@ class Regularisation:
         return (np.arange(len(singular)) < self.amount).astype(np.float64)
 
     def words(self) -> str:
-        """Return what it is."""
+        """Return a description of the regularisation."""
         if self.space == "raw":
             return f"ridge regression on coefficients, penalty {self.amount:.2g} of the largest variance"
         return f"least squares on the first {self.amount:.0f} principal components"
@@ -59,8 +59,10 @@ class TrainingDecomposition:
 
     Args:
         middle: (K,) weighted mean of the coefficients.
-        left: (n, r), singular: (r,), right: (r, K) of the centred coefficients times the square root of `weight`.
-        weight: (n,) of the rows.
+        left: (n, r) left singular vectors of the centred coefficients times the square root of `weight`.
+        singular: (r,) singular values.
+        right: (r, K) right singular vectors.
+        weight: (n,) weights of the rows.
     """
 
     middle: FloatArray
@@ -104,12 +106,12 @@ def weighted_mean(values: FloatArray, weight: FloatArray) -> FloatArray:
 
 
 def folds_of(codes: IndexArray, count: int, rng: np.random.Generator) -> IndexArray:
-    """Return the fold (N,) of each row, dealt out by subjects, so that none stands in two.
+    """Return the fold (N,) of each row, dealt out by subjects, so that no subject is in two folds.
 
     Args:
         codes: (N,) number of the subject of each row.
-        count: of folds.
-        rng: the only source of chance.
+        count: number of folds.
+        rng: only source of randomness.
     """
     subjects = np.unique(codes)
     dealt = np.empty(int(subjects.max()) + 1, dtype=np.intp)
@@ -131,11 +133,11 @@ def errors_of(
 
 @dataclass(frozen=True, eq=False)
 class NestedPredictions:
-    """What nested cross-validation predicts of rows left out.
+    """Predictions of held-out rows by nested cross-validation.
 
     Args:
-        predicted: (N, P) for each column of targets.
-        baseline: (N, P) the weighted mean of the training set.
+        predicted: (N, P) predictions of each column of targets.
+        baseline: (N, P) weighted mean of the training set.
         chosen: (F, P) index of the choice in each outer fold.
     """
 
@@ -153,16 +155,16 @@ def nested(
     choices: Sequence[Regularisation] = CHOICES,
     on_fold: Callable[[int, int], None] | None = None,
 ) -> NestedPredictions:
-    """Return predictions of all rows, each by a training set that has nothing of its subject, nor the choice either.
+    """Return predictions of all rows, whose training sets and choices do not use the subject of the row.
 
     Args:
         X: (N, K) coefficients.
-        targets: (N, P).
-        weight: (N,) of rows in means, fits and errors.
+        targets: (N, P) targets.
+        weight: (N,) weights of rows in means, fits and errors.
         outer: (N,) fold of each row.
-        inner: for each outer fold, the folds (n,) of its training rows.
-        choices: to choose from.
-        on_fold: called with (outer folds done, in all).
+        inner: (n,) folds of the training rows, for each outer fold.
+        choices: regularisations to choose from.
+        on_fold: function called with (outer folds done, in all).
     """
     predicted, baseline = np.empty_like(targets), np.empty_like(targets)
     chosen: list[IndexArray] = []

@@ -18,7 +18,7 @@ from shapespace.types import BoolArray, FloatArray
 
 _BLOCK = 64  # permutations at a time; bounds memory
 _TIE = 1e-10
-"""Share by which a statistic that is the same in other words may differ by rounding."""
+"""Relative rounding error within which two equal statistics may differ."""
 _FLOOR = 1e-12  # share of the squares; a variance below is rounding
 LEVEL = 0.05
 """Family-wise error of maps, and one minus the confidence of their intervals."""
@@ -26,16 +26,16 @@ LEVEL = 0.05
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MapTest:
-    """What a test of maps says.
+    """Result of a test of maps.
 
     Args:
         effect: (V,) mean, or difference of the means of two groups.
         t: (V,) Student's t.
-        p: (V,) with the error over all vertices held, by the permutation maximum of |t|.
-        omnibus_p: of any change at all.
-        permutations: that were made, the data's own among them.
-        every: whether these are all there are.
-        n: subjects, or subjects of each group.
+        p: (V,) family-wise p over all vertices, by the permutation maximum of |t|.
+        omnibus_p: p of the test for any change.
+        permutations: number of permutations, the observed data among them.
+        every: whether these are all possible permutations.
+        n: number of subjects, or numbers of subjects of each group.
         critical_t: |t| above which `p` is at most `LEVEL`; effect ± |effect / t| critical_t are simultaneous
             intervals.
         unequal_variances: whether t is Welch's, compared with sign flips, which allows groups of unequal variance.
@@ -66,14 +66,14 @@ def mean_test(
     seed: int,
     progress: Callable[[int, int], None] | None = None,
 ) -> MapTest:
-    """Return whether the mean of `maps` (N, V) differs from none, each as likely with the other sign if it does not.
+    """Test whether the mean of `maps` (N, V) differs from zero; without a difference both signs are equally likely.
 
     Args:
-        maps: of N subjects, 2 or more.
-        area: (V,) with which vertices count in the omnibus test: that of the mean's square.
-        permutations: at most; all sign flips where they are no more.
-        seed: of random ones.
-        progress: called with (done, total) permutations.
+        maps: (N, V) maps of 2 or more subjects.
+        area: (V,) weights of the vertices in the omnibus test of the squared mean.
+        permutations: largest number of permutations; all sign flips if there are no more.
+        seed: seed of random permutations.
+        progress: function called with (done, total) permutations.
     """
     n = len(maps)
     every = 2 ** (n - 1) <= permutations
@@ -92,7 +92,7 @@ def mean_test(
         yield np.ones(n)
         yield from (rng.choice((-1.0, 1.0), n) for _ in range(count - 1))
 
-    t, p, omnibus_p, critical = _permuted(maps, area, draws(), count, t_of, progress)
+    t, p, omnibus_p, critical = _permute(maps, area, draws(), count, t_of, progress)
     return MapTest(
         effect=maps.mean(axis=0),
         t=t,
@@ -115,7 +115,7 @@ def difference_test(
     *,
     unequal_variances: bool = False,
 ) -> MapTest:
-    """Return whether the mean of `maps` (N, V) differs between subjects that are `second` (N,) and those that are not.
+    """Test whether the mean of `maps` (N, V) differs between subjects that are `second` (N,) and those that are not.
 
     Subjects are permuted between the groups, which assumes equal variances of the groups; with `unequal_variances`
     Welch's t is compared with sign flips of residuals instead. Other arguments are those of `mean_test`; each group has
@@ -163,7 +163,7 @@ def difference_test(
         rng = np.random.default_rng(seed)
         yield from (contrast(rng.permutation(second)) for _ in range(count - 1))
 
-    t, p, omnibus_p, critical = _permuted(centred, area, draws(), count, t_of, progress)
+    t, p, omnibus_p, critical = _permute(centred, area, draws(), count, t_of, progress)
     return MapTest(
         effect=contrast(second) @ maps,
         t=t,
@@ -176,7 +176,7 @@ def difference_test(
     )
 
 
-def _permuted(
+def _permute(
     maps: FloatArray,
     area: FloatArray,
     draws: Iterator[FloatArray],

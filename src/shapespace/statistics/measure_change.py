@@ -46,11 +46,11 @@ from shapespace.statistics.observation_weights import weights_of
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, SurfaceLandmarks, require
 
 WHOLE = "whole"
-"""Name of the whole surface among the regions."""
+"""Name of the complete surface among the regions."""
 _ROUNDING = 1e-4
-"""Share of the size by which surfaces in files are rounded, at most."""
+"""Largest share of the size by which surfaces in files are rounded."""
 _COUNTED = 0.5
-"""Of the weight that it could have, from which a vertex counts as stable."""
+"""Share of its largest possible weight from which a vertex counts as stable."""
 
 
 def change(
@@ -63,9 +63,9 @@ def change(
     by the fits, else the spread over the stable part.
 
     Args:
-        cohort: in the gauge `form`, with triangles; its table contains subject and time of each shape.
-        config: None for the defaults.
-        progress: called with (done, total) subjects.
+        cohort: cohort in the gauge `form`, with triangles; its table contains subject and time of each shape.
+        config: options; None for the defaults.
+        progress: function called with (done, total) subjects.
 
     Raises:
         FileError: the file of the stable region cannot be read.
@@ -74,7 +74,7 @@ def change(
     """
     require(cohort, Cohort, "change", "read one with shapespace.read_cohort")
     config = config or ChangeConfig()
-    _refuse_unsuitable(cohort, config)
+    _check_cohort(cohort, config)
     time = time_column(cohort.table, config.time)
     columns = [config.subject, time, *([config.group] if config.group else [])]
     cohort = cohort.complete(columns, drop_missing=config.drop_missing, numbers=[time])
@@ -132,7 +132,7 @@ def change(
     return _add_tests(result, groups)
 
 
-def _refuse_unsuitable(cohort: Cohort, config: ChangeConfig) -> None:
+def _check_cohort(cohort: Cohort, config: ChangeConfig) -> None:
     """Check that changes of a cohort can be measured in millimetres along normals.
 
     Raises:
@@ -151,7 +151,7 @@ def _refuse_unsuitable(cohort: Cohort, config: ChangeConfig) -> None:
 
 
 def _indicator(vertices: IntArray, n_vertices: int) -> FloatArray:
-    """Return (V,) 1 for some vertices and 0 for the others."""
+    """Return (V,) numbers, 1 for some vertices and 0 for the others."""
     indicator = np.zeros(n_vertices)
     indicator[vertices] = 1.0
     return indicator
@@ -169,14 +169,14 @@ def _is_model_only(cohort: Cohort) -> bool:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Problem:
-    """What the estimates of all subjects have in common.
+    """Input that the estimates of all subjects have in common.
 
     Args:
-        cohort: the scans.
-        landmarks: on the surfaces.
-        regions: (P, V) 1 for the vertices of each region, the whole first.
+        cohort: cohort of the scans.
+        landmarks: landmarks on the surfaces.
+        regions: (P, V) 1 for the vertices of each region, the complete surface first.
         uncertainty: source of the standard deviations, as in `ChangeResult`.
-        time_unit: of rates; empty for none.
+        time_unit: unit of rates; empty if times are words.
         is_closed: whether the surface is closed.
     """
 
@@ -275,7 +275,7 @@ def _draft(problem: _Problem, name: str, subject: AlignedVisits) -> _SubjectDraf
 def _uncertainty(
     problem: _Problem, subject: AlignedVisits, weights: FloatArray, noise_ratio: float
 ) -> ChangeUncertainty:
-    """Return the standard deviations of a sum over visits by `weights` (T,); 0 where rescans replace them.
+    """Return the standard deviations of a sum over visits by `weights` (T,); 0 if rescans replace them.
 
     `noise_ratio` is the noise of the sum divided by that of the difference of the last visit and the first.
     """
@@ -289,7 +289,7 @@ def _uncertainty(
 
 
 def _regions(cohort: Cohort, config: ChangeConfig) -> dict[str, IntArray]:
-    """Return name -> vertices of the whole surface and of the regions whose volumes are measured.
+    """Return name -> vertices of the complete surface and of the regions whose volumes are measured.
 
     Raises:
         InputError: a region with vertices that the surfaces do not have.
@@ -302,7 +302,7 @@ def _regions(cohort: Cohort, config: ChangeConfig) -> dict[str, IntArray]:
 
 
 def _groups(cohort: Cohort, config: ChangeConfig, visits: Visits, single: Sequence[str]) -> dict[str, str]:
-    """Return subject -> its group; empty without groups.
+    """Return subject -> group of the subject; empty without groups.
 
     Raises:
         InputError: a subject in two groups, or other than two groups of two subjects with two visits.
@@ -315,7 +315,7 @@ def _groups(cohort: Cohort, config: ChangeConfig, visits: Visits, single: Sequen
         groups = sorted({cells[row] for visit in own for row in visit.rows})
         if len(groups) > 1:
             raise InputError(
-                f"{where}: {name} is in two groups by {config.group!r} ({', '.join(groups[:2])}); correct one of them."
+                f"{where}: {name} is in two groups by {config.group!r} ({', '.join(groups[:2])}); correct the table."
             )
         if name not in single:
             group_of_subject[name] = groups[0]
@@ -349,8 +349,8 @@ def _dispersion(result: ChangeResult, maps: FloatArray, second: BoolArray, area:
 def _blank(subjects: Sequence[SubjectChange]) -> BoolArray:
     """Return (V,) bool, where maps are blank: too few subjects, of all or of a group, observe the vertex."""
     every = np.ones(len(subjects[0].area_mm2), dtype=np.bool_)
-    observed = np.stack([every if one.observed is None else one.observed for one in subjects])
-    groups = np.array([one.group for one in subjects])
+    observed = np.stack([every if subject.observed is None else subject.observed for subject in subjects])
+    groups = np.array([subject.group for subject in subjects])
     shares = [observed[groups == group].mean(axis=0) for group in dict.fromkeys(groups.tolist())]
     return weights_of(np.min(shares, axis=0)) == 0
 
@@ -359,7 +359,7 @@ def _add_tests(result: ChangeResult, groups: Mapping[str, str]) -> ChangeResult:
     """Return a result with its tests over subjects."""
     config, subjects = result.config, result.subjects
     if config.rate and not result.time_unit:
-        raise InputError("Rates need times that are numbers or dates; leave out --rate, or name such a --time.")
+        raise InputError("Rates need times that are numbers or dates; remove --rate, or name such a --time.")
     if len(subjects) < 2:
         return result
     estimates = [change_or_rate(subject, rate=config.rate) for subject in subjects]

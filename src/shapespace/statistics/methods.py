@@ -15,22 +15,22 @@ from shapespace.statistics.dispersion import DispersionTest
 from shapespace.statistics.tolerances import RANK
 
 SCAN_OF_SUBJECT = "scan of a subject"
-"""`TestScheme.unit` where values are permuted within subjects, and between subjects with the same number of scans."""
+"""`TestScheme.unit` if values are permuted within subjects, and between subjects with the same number of scans."""
 REDUCED_OF_EACH_TERM = ("the reduced model of each term",)
 """`TestScheme.reduced_model` of several terms, each tested by residuals of the model of the other terms."""
 
 _ALONG = 0.01
-"""Of the squared distance from the mean: shapes of one size vary along the mean by half of it, those in the tangent
-space at the mean by nothing."""
+"""Largest share of the squared distance from the mean that shapes in the tangent space may vary along the mean.
+Shapes of one size vary along the mean by half of their squared distance, those in the tangent space by nothing."""
 
 
 def methods_of(cohort: Cohort, subjects: int, **known: Any) -> Methods:
     """Return the methods of an analysis of all coefficients of a cohort.
 
     Args:
-        cohort: the shapes.
+        cohort: cohort of the shapes.
         subjects: number of subjects.
-        **known: further fields of `Methods`, or others than those of the cohort.
+        **known: further fields of `Methods`, or fields that replace those of the cohort.
     """
     centred = cohort.coefficients - cohort.coefficients.mean(axis=0)
     mean = cohort.vertices(cohort.coefficients.mean(axis=0))
@@ -57,11 +57,11 @@ def sample_sizes(subjects: Sequence[str], variables: Sequence[tuple[str, Sequenc
     """Return the subjects and shapes of each class of each variable, and of each combination of their classes.
 
     Args:
-        subjects: of each shape.
-        variables: name and the class of each shape.
+        subjects: subject of each shape.
+        variables: name of each variable, and the class of each shape.
     """
     sizes: list[SampleSize] = []
-    sets: list[tuple[tuple[str, Sequence[str]], ...]] = [(one,) for one in variables]
+    sets: list[tuple[tuple[str, Sequence[str]], ...]] = [(variable,) for variable in variables]
     if len(variables) > 1:
         sets.append(tuple(variables))
     for chosen in sets:
@@ -96,10 +96,10 @@ class AnalysisResult:
     def save(self, folder: Path | str) -> Path:
         """Write the report, tables, arrays and meshes to a folder.
 
-        `shapespace report FOLDER` draws the report from these files.
+        The command `shapespace report FOLDER` renders the report from these files.
 
         Args:
-            folder: is created if it does not exist.
+            folder: output folder; created if it does not exist.
 
         Returns:
             The path of analysis.json.

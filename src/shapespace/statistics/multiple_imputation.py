@@ -34,7 +34,7 @@ _Result = TypeVar("_Result")
 
 @dataclass(frozen=True)
 class Imputations:
-    """What multiple imputation contributed to a result.
+    """Contribution of multiple imputation to a result.
 
     Args:
         count: number of imputations, M.
@@ -99,7 +99,7 @@ def pool_p_values(p: FloatArray, least: float) -> tuple[FloatArray, FloatArray]:
 
 
 def pool_intervals(figures: FloatArray, level: float) -> FloatArray:
-    """Combine estimates with intervals, whose halves stand for the standard deviation on either side.
+    """Combine estimates with intervals, whose halves replace the standard deviation on either side.
 
     Args:
         figures: (M, ..., 3) estimate, low and high of each imputation.
@@ -123,15 +123,15 @@ def over_imputations(
     finish: Callable[[Any], Any] = lambda result: result,
     fixed: Callable[[Any], Mapping[str, Any]] = lambda result: {},
 ) -> Callable[[Callable[_Options, _Result]], Callable[_Options, _Result]]:
-    """Return a decorator of an analysis: where its cohorts have samples, each imputation is analysed too, and combined.
+    """Return a decorator of an analysis: if its cohorts have samples, each imputation is analysed too, and combined.
 
-    Options, permutations and seeds are the same in each imputation, of which one at a time is in memory. p values and
-    estimates with intervals are combined; other numbers of the result are those of the completed shapes.
+    Options, permutations and seeds are the same in each imputation, and one imputation at a time is in memory. p values
+    and estimates with intervals are combined; other numbers of the result are those of the completed shapes.
 
     Args:
         parts: fields whose content is searched for p values and intervals too.
         means: fields of the result that become means over the imputations.
-        finish: to the combined result, to update what depends on p.
+        finish: function applied to the combined result, to update values that depend on p.
         fixed: arguments of each imputation that follow from the result of the completed shapes, such as a choice of
             the test.
     """
@@ -141,13 +141,15 @@ def over_imputations(
         def analyse_all(*args: _Options.args, **options: _Options.kwargs) -> _Result:
             given = cast("tuple[Any, ...]", args), cast("dict[str, Any]", options)
             values = (*given[0], *given[1].values())
-            count = min((own for one in values if isinstance(one, Cohort) and (own := one.imputations)), default=0)
+            count = min(
+                (own for value in values if isinstance(value, Cohort) and (own := value.imputations)), default=0
+            )
             if count < 2:
                 return analyse(*args, **options)
             result = _analyse_one(analyse, *given, None, count)
             own = {**signature(analyse).bind(*args, **options).arguments, **fixed(result)}
             each = [_figures(_analyse_one(analyse, (), own, k, count), parts, means) for k in range(count)]
-            return finish(_pooled(result, each, parts, means))
+            return finish(_pool(result, each, parts, means))
 
         return analyse_all
 
@@ -158,7 +160,7 @@ def _analyse_one(
     analyse: Callable[..., _Result], args: Sequence[Any], options: Mapping[str, Any], k: int | None, count: int
 ) -> _Result:
     """Return the analysis of imputation `k` of all cohorts, aligned to the first; None for the completed shapes."""
-    first = next(one for one in (*args, *options.values()) if isinstance(one, Cohort))
+    first = next(value for value in (*args, *options.values()) if isinstance(value, Cohort))
 
     def imputed(value: Any) -> Any:
         if k is None or not isinstance(value, Cohort) or not value.imputations:
@@ -177,11 +179,11 @@ def _report_part(progress: Progress, run: int, runs: int, done: int, total: int)
 
 
 def _visit(value: Any, parts: Collection[str], change: Callable[[Any], Mapping[str, Any]]) -> Any:
-    """Return a result with the fields that `change` returns for it, and for each part of it in turn."""
+    """Return a result with the fields that `change` returns for it, and for each of its parts in turn."""
     if isinstance(value, tuple):
-        return tuple(_visit(one, parts, change) for one in cast("tuple[Any, ...]", value))
+        return tuple(_visit(item, parts, change) for item in cast("tuple[Any, ...]", value))
     if isinstance(value, dict):
-        return {key: _visit(one, parts, change) for key, one in cast("dict[Any, Any]", value).items()}
+        return {key: _visit(item, parts, change) for key, item in cast("dict[Any, Any]", value).items()}
     if not is_dataclass(value) or isinstance(value, type):
         return value
     inner = {name: _visit(getattr(value, name), parts, change) for name in parts if hasattr(value, name)}
@@ -193,7 +195,7 @@ def _figures(result: Any, parts: Collection[str], means: Collection[str]) -> _Fi
     found: list[Mapping[str, Any]] = []
 
     def collect(owner: Any) -> Mapping[str, Any]:
-        intervals = [one for names in _INTERVALS if all(hasattr(owner, name) for name in names) for one in names]
+        intervals = [name for names in _INTERVALS if all(hasattr(owner, own) for own in names) for name in names]
         names = (*_P_VALUES, "unknown_p", *means, *intervals)
         found.append({name: getattr(owner, name) for name in names if getattr(owner, name, None) is not None})
         return {}
@@ -202,9 +204,9 @@ def _figures(result: Any, parts: Collection[str], means: Collection[str]) -> _Fi
     return found
 
 
-def _pooled(result: Any, each: Sequence[_Figures], parts: Collection[str], means: Collection[str]) -> Any:
-    """Return a result with the figures of all imputations combined."""
-    tests = [one.arrangements for one in result.methods.tests if one.resampling in ("permutation", "sign flips")]
+def _pool(result: Any, each: Sequence[_Figures], parts: Collection[str], means: Collection[str]) -> Any:
+    """Return a result with the numbers of all imputations combined."""
+    tests = [test.arrangements for test in result.methods.tests if test.resampling in ("permutation", "sign flips")]
     numbers, missing, stddev = iter(range(len(each[0]))), dict[str, float](), dict[str, FloatArray]()
 
     def combine(owner: Any) -> Mapping[str, Any]:
@@ -213,10 +215,10 @@ def _pooled(result: Any, each: Sequence[_Figures], parts: Collection[str], means
         if unknown:
             return {"p": None, **unknown}
         values = {name: np.stack([own[number][name] for own in each]) for name in each[0][number]}
-        for name in (one for one in values.keys() & set(_P_VALUES) if getattr(owner, one) is not None):
+        for name in (field for field in values.keys() & set(_P_VALUES) if getattr(owner, field) is not None):
             p, fraction = pool_p_values(values[name], 1 / max(tests, default=_LARGEST))
             changed[name] = np.where(getattr(owner, name) == 1, 1.0, p)  # blank vertices keep p = 1
-            label = next((str(getattr(owner, one)) for one in _LABELS if hasattr(owner, one)), "")
+            label = next((str(getattr(owner, field)) for field in _LABELS if hasattr(owner, field)), "")
             if name == "p" and label:
                 missing.setdefault(f"{label} {getattr(owner, 'stratum', '')}".strip(), float(fraction))
         for name in values.keys() & set(means):
@@ -225,6 +227,6 @@ def _pooled(result: Any, each: Sequence[_Figures], parts: Collection[str], means
         for names in (names for names in _INTERVALS if names[0] in values):
             ends = pool_intervals(np.stack([values[name] for name in names], axis=-1), result.confidence)
             changed |= {name: ends[..., k] for k, name in enumerate(names)}
-        return {name: read_only(one) if one.ndim else float(one) for name, one in changed.items()}
+        return {name: read_only(array) if array.ndim else float(array) for name, array in changed.items()}
 
     return replace(_visit(result, parts, combine), imputations=Imputations(len(each), missing, stddev))

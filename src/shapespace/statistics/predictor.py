@@ -31,7 +31,7 @@ from shapespace.types import FloatArray, read_only
 
 FORMAT, VERSION = "shapespace predictor", 1
 _ROUNDING = 1e-9  # relative slack, so that training shapes never count as outside their own range
-_AGAIN = "make it again with shapespace regress"
+_REMAKE = "make it again with shapespace regress"
 _FLOATS = ("mean", "weights", "intercepts", "residuals", "share")
 _FACTS = ("target", "gauge", "model_hash", "lowest", "highest", "farthest_mm", "subjects", "confidence", "method")
 
@@ -41,11 +41,11 @@ class Predictions:
     """Predicted values of n shapes.
 
     Args:
-        names: of them.
-        value: (n,).
-        low, high: (n,) interval.
-        outside: n sentences on what lies outside what was learned from; empty where nothing does.
-        imputations: those that predictions combine; None without samples of completed shapes.
+        names: names of the shapes.
+        value: (n,) predicted values.
+        low, high: (n,) ends of the intervals.
+        outside: n sentences that describe how a shape lies outside the training data; empty if it does not.
+        imputations: imputations that predictions combine; None without samples of completed shapes.
 
     Example:
         >>> predictor = ss.statistics.regress(cohort, "age", subject="subject").predictor
@@ -69,23 +69,23 @@ class Predictions:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Predictor:
-    """A number as a linear function of where the vertices lie.
+    """A number as a linear function of the positions of the vertices.
 
     Args:
-        target: what is predicted.
-        gauge: of the shapes.
-        model_hash: of the model whose fits it takes; empty for other surfaces, which it aligns itself.
-        mean: (V, 3) mm of the shapes learned from.
-        weights: (1 + F, 3V) per mm: learned from all, then without each fold.
-        intercepts: (1 + F,) what each predicts of the mean.
-        residuals: (N,) of rows, predicted without their fold; absolute.
-        fold: (N,) theirs, from 1.
-        share: (N,) how much a row counts: 1 over the rows of its subject.
-        lowest, highest: of the targets learned from.
-        farthest_mm: RMS distance from the mean of the shape learned from that lies furthest.
-        subjects: how many were learned from.
+        target: name of the predicted number.
+        gauge: gauge of the shapes.
+        model_hash: hash of the model whose fits it takes; empty for other surfaces, which it aligns itself.
+        mean: (V, 3) mean of the training shapes, mm.
+        weights: (1 + F, 3V) weights per mm: first of all training shapes, then without each fold.
+        intercepts: (1 + F,) predictions for the mean.
+        residuals: (N,) absolute residuals of the training rows, each predicted without its fold.
+        fold: (N,) fold of each training row, from 1.
+        share: (N,) weight of each training row: 1 over the number of rows of its subject.
+        lowest, highest: ends of the range of the training targets.
+        farthest_mm: largest RMS distance of a training shape from the mean.
+        subjects: number of training subjects.
         confidence: level of the intervals.
-        method: in words.
+        method: method of the regression, in words.
 
     Example:
         >>> predictor = ss.statistics.regress(cohort, "age", subject="subject").predictor
@@ -119,7 +119,7 @@ class Predictor:
         return lazy_import("html_of_predictor")(self)
 
     def predict(self, cohort: Cohort) -> Predictions:
-        """Return what is predicted of the shapes of a cohort, of subjects that were not learned from.
+        """Predict the number from the shapes of a cohort, of subjects that are not in the training data.
 
         Predictions of completed shapes with samples combine the imputations by Rubin's rules.
 
@@ -132,17 +132,17 @@ class Predictor:
         if cohort.imputations < 2:
             return result
         each = [self._predict(cohort.imputation(k)) for k in range(cohort.imputations)]
-        figures = np.stack([np.column_stack([one.value, one.low, one.high]) for one in each])
+        figures = np.stack([np.column_stack([own.value, own.low, own.high]) for own in each])
         value, low, high = map(read_only, pool_intervals(figures, self.confidence).T)
         return replace(result, value=value, low=low, high=high, imputations=Imputations(len(each), {}, {}))
 
     def _predict(self, cohort: Cohort) -> Predictions:
-        off = np.stack([self._placed(cohort.vertices(k)) for k in range(len(cohort))]) - self.mean
+        off = np.stack([self._align(cohort.vertices(k)) for k in range(len(cohort))]) - self.mean
         all_ways = off.reshape(len(off), -1) @ self.weights.T + self.intercepts
         low, high = cv_plus(all_ways[:, 1:], self.residuals, self.fold - 1, self.share, self.confidence)
         away = np.sqrt((off**2).sum(axis=2).mean(axis=1))
         outside = tuple(
-            self._outside(float(value), float(length), cohort.unit)
+            self._describe_outside(float(value), float(length), cohort.unit)
             for value, length in zip(all_ways[:, 0], away, strict=True)
         )
         return Predictions(cohort.names, read_only(all_ways[:, 0]), low, high, outside)
@@ -151,20 +151,20 @@ class Predictor:
         if cohort.n_vertices != len(self.mean):
             raise CorrespondenceError(
                 f"The shapes have {cohort.n_vertices} vertices, and those that {self.target} was learned from "
-                f"{len(self.mean)}; give shapes in correspondence with those."
+                f"{len(self.mean)}; give shapes in correspondence with the training shapes."
             )
         own = model_hash_of(cohort)
         if own != self.model_hash:
             raise CorrespondenceError(
                 f"{self.target} was learned from {'fits by another model' if self.model_hash else 'surfaces'}, and the "
-                f"new shapes are {'fits by this one' if own else 'surfaces'}; give such as it was learned from."
+                f"new shapes are {'fits by this one' if own else 'surfaces'}; give shapes like the training shapes."
             )
         if cohort.gauge != self.gauge:
             raise InputError(f"{self.target} was learned in the gauge {self.gauge}, not {cohort.gauge}; read the new "
                              f"shapes with --set gauge={self.gauge}.")  # fmt: skip
 
-    def _placed(self, vertices: FloatArray) -> FloatArray:
-        """Return a shape (V, 3) in the pose, and in the gauge `shape` the scale, of those learned from."""
+    def _align(self, vertices: FloatArray) -> FloatArray:
+        """Return a shape (V, 3) in the pose of the training shapes, and in the gauge `shape` also in their scale."""
         if self.model_hash:
             return vertices
         placed = fit_similarity(vertices, self.mean, with_scale=False).apply(vertices)
@@ -174,17 +174,17 @@ class Predictor:
             placed = centre + own * float((other**2).sum() / (own * other).sum())
         return placed
 
-    def _outside(self, value: float, away: float, unit: str) -> str:
+    def _describe_outside(self, value: float, away: float, unit: str) -> str:
         if away > self.farthest_mm * (1 + _ROUNDING):
             own, farthest = (f"{length:.2f} {unit}" if unit else f"{length:.4f}" for length in (away, self.farthest_mm))
-            return f"its shape lies {own} RMS from the mean, beyond all learned from ({farthest})"
+            return f"its shape lies {own} RMS from the mean, beyond all training shapes ({farthest})"
         slack = _ROUNDING * (self.highest - self.lowest)
         if not self.lowest - slack <= value <= self.highest + slack:
             return f"{self.target} was learned between {self.lowest:g} and {self.highest:g} alone"
         return ""
 
     def save(self, path: Path | str) -> None:
-        """Write it as numbers alone, .npz.
+        """Write the predictor to a file of numbers, .npz.
 
         Raises:
             FileError: the folder cannot be written.
@@ -196,26 +196,26 @@ class Predictor:
 
     @staticmethod
     def load(path: Path | str) -> Predictor:
-        """Return the predictor in a file, which is checked, and of which nothing is run.
+        """Return the predictor in a file, which is checked and never executed.
 
         Raises:
-            FileError: it cannot be read.
-            FileFormatError: it is none, of another version, or damaged.
+            FileError: the file cannot be read.
+            FileFormatError: the file is no predictor, of another version, or damaged.
         """
         path = Path(path)
-        arrays = read_arrays(path, _AGAIN, (*_FLOATS, "fold", "facts"))
+        arrays = read_arrays(path, _REMAKE, (*_FLOATS, "fold", "facts"))
         try:
-            facts = _facts(arrays)
+            facts = _read_facts(arrays)
             parts = {name: read_only(arrays[name]) for name in _FLOATS}
             made = Predictor(**facts, fold=np.asarray(arrays["fold"], dtype=np.intp), **cast(dict[str, Any], parts))
         except (KeyError, TypeError, ValueError) as error:
-            raise FileFormatError(f"{path} is no predictor of shapespace, or it is damaged; {_AGAIN}.") from error
-        wrong = made._wrong()
+            raise FileFormatError(f"{path} is no predictor of shapespace, or it is damaged; {_REMAKE}.") from error
+        wrong = made._find_fault()
         if wrong:
-            raise FileFormatError(f"{path} is damaged ({wrong}); {_AGAIN}.")
+            raise FileFormatError(f"{path} is damaged ({wrong}); {_REMAKE}.")
         return made
 
-    def _wrong(self) -> str:
+    def _find_fault(self) -> str:
         ways, rows = len(self.intercepts), len(self.residuals)
         if self.mean.ndim != 2 or self.mean.shape[1] != 3 or self.intercepts.ndim != 1 or self.residuals.ndim != 1:
             return "its arrays have other dimensions"
@@ -224,13 +224,13 @@ class Predictor:
         if ways < 3 or not rows or self.fold.min() < 1 or self.fold.max() >= ways:
             return "its folds do not exist"
         if not all(np.isfinite(getattr(self, name)).all() for name in _FLOATS):
-            return "it holds numbers that are not finite"
+            return "it contains numbers that are not finite"
         if (self.residuals < 0).any() or (self.share <= 0).any() or not 0 < self.confidence < 1:
-            return "it holds numbers that cannot be"
+            return "it contains numbers that are out of range"
         return ""
 
 
-def _facts(arrays: Mapping[str, npt.NDArray[Any]]) -> dict[str, Any]:
+def _read_facts(arrays: Mapping[str, npt.NDArray[Any]]) -> dict[str, Any]:
     content: object = plain_json(str(arrays["facts"]))
     if not isinstance(content, dict):
         raise ValueError("no facts")
@@ -247,7 +247,7 @@ def _facts(arrays: Mapping[str, npt.NDArray[Any]]) -> dict[str, Any]:
 
 
 def model_hash_of(cohort: Cohort) -> str:
-    """Return the hash of the model whose coefficients a cohort's shapes are; empty where they are surfaces."""
+    """Return the hash of the model whose coefficients a cohort's shapes are; empty if they are surfaces."""
     if cohort.fitted is None:
         return ""
     # Coefficients are counted from the model's mean, in its own size or another; surfaces from their own mean.
@@ -264,9 +264,9 @@ def cv_plus(
 
     Args:
         ways: (n, F) predictions by the regression without each fold.
-        residuals: (N,) absolute, of rows predicted without their fold.
-        fold: (N,) theirs, from 0.
-        share: (N,) how much each counts; they sum to the number of subjects.
+        residuals: (N,) absolute residuals of the training rows, each predicted without its fold.
+        fold: (N,) fold of each training row, from 0.
+        share: (N,) weight of each training row; the weights sum to the number of subjects.
         confidence: level of the interval; with too few subjects for it the ends are the outermost.
     """
     subjects = float(share.sum())
@@ -278,7 +278,7 @@ def cv_plus(
 
 
 def _weighted_quantile(values: FloatArray, share: FloatArray, past: float) -> FloatArray:
-    """Return (n,) the least of each row of `values` (n, N) up to which `share` (N,) sums to `past`."""
+    """Return (n,) the smallest value of each row of `values` (n, N) up to which `share` (N,) sums to `past`."""
     order = np.argsort(values, axis=1, kind="stable")
     reached = np.cumsum(share[order], axis=1) >= past - 1e-9
     reached[:, -1] = True
@@ -287,14 +287,14 @@ def _weighted_quantile(values: FloatArray, share: FloatArray, past: float) -> Fl
 
 
 def refuse_known(known: tuple[str, ...], new: tuple[str, ...], where: str) -> None:
-    """Refuse new shapes of subjects that were learned from.
+    """Check that new shapes are not of training subjects.
 
     Raises:
-        InputError: there are such.
+        InputError: some are of training subjects.
     """
     both = sorted(set(known) & set(new))
     if both:
         raise InputError(
-            f"{where}: {list_names(both)} {'was' if len(both) == 1 else 'were'} learned from too, so what is predicted "
-            "of them says nothing; leave them out."
+            f"{where}: {list_names(both)} {'was' if len(both) == 1 else 'were'} learned from too, so their predictions "
+            "are meaningless; exclude them."
         )

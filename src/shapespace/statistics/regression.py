@@ -1,4 +1,4 @@
-"""Regression the other way: a number, such as age or a severity, from shape, and the shape that goes with it."""
+"""Regression of a number, such as age or a severity, on shape, and the mean shape as a function of the number."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from shapespace.step_counter import StepCounter
 from shapespace.types import FloatArray, read_only, require
 
 SMALL = 100
-"""Subjects below which a sample is said to be small."""
+"""Number of subjects below which a sample is reported as small."""
 MEASURES = ("r2", "rmse", "mae", "slope", "intercept", "coverage", "width")
 _BLOCK = 500  # permutations at a time; bounds memory
 
 
 @dataclass(frozen=True)
 class AccuracyMeasure:
-    """A figure of predictions on subjects left out, with its interval by drawing subjects anew; NaN where undefined."""
+    """A measure of predictions on held-out subjects, with its interval by resampling subjects; NaN if undefined."""
 
     value: float
     low: float
@@ -51,29 +51,29 @@ class RegressionResult(AnalysisResult):
     """A regression of a number on shape, with its cross-validated accuracy.
 
     Args:
-        cohort: the N shapes.
-        target: the number.
-        observed: (N,) of it.
-        subjects: (N,) names.
-        predicted: (N,) by nested cross-validation: neither the regression nor its choice saw the subject.
-        low, high: (N,) intervals, made likewise.
+        cohort: cohort of the N shapes.
+        target: column of the predicted number.
+        observed: (N,) values of the number.
+        subjects: (N,) name of the subject of each shape.
+        predicted: (N,) predictions by nested cross-validation: neither the regression nor its choice used the subject.
+        low, high: (N,) ends of intervals, by the same cross-validation.
         baseline: (N,) the mean of the training set, to which each subject contributes once.
-        measures: by the names in `MEASURES`; `r2` against the baseline, `slope` and `intercept` of the observed on the
-            predicted, `coverage` and `width` of the intervals. Each subject counts once.
-        baseline_rmse: of predicting the mean,
-        baseline_mae: likewise.
-        p: of R2 by permutation of the targets among subjects; None without permutations.
-        choice: made on all rows.
-        effective: its degrees of freedom.
+        measures: measures of accuracy by the names in `MEASURES`; `r2` against the baseline, `slope` and `intercept` of
+            the observed on the predicted, `coverage` and `width` of the intervals. Each subject counts once.
+        baseline_rmse: root mean squared error of predicting the mean.
+        baseline_mae: mean absolute error of predicting the mean.
+        p: p of R2 by permutation of the targets among subjects; None without permutations.
+        choice: regularisation that is chosen on all rows.
+        effective: effective degrees of freedom of the choice.
         predictor: learned from all rows.
         shapes: the mean shapes along the target.
         confidence: level of all intervals.
-        folds: of the outer cross-validation.
-        permutations: how many.
-        draws: of subjects, for intervals of figures.
-        seed: of folds, permutations and draws.
+        folds: number of folds of the outer cross-validation.
+        permutations: number of permutations.
+        draws: number of random draws of subjects, for the intervals of measures.
+        seed: seed of folds, permutations and draws.
         subject: column of the subjects, as given; None for the default.
-        imputations: those that p, predictions and measures combine; None without samples of completed shapes.
+        imputations: imputations that p, predictions and measures combine; None without samples of completed shapes.
 
     Example:
         >>> result = ss.statistics.regress(cohort, "age", subject="subject")
@@ -112,7 +112,7 @@ class RegressionResult(AnalysisResult):
 
     @property
     def small(self) -> bool:
-        """Whether the sample is small: figures on fewer than `SMALL` subjects scatter widely from sample to sample."""
+        """Whether the sample is small: measures on fewer than `SMALL` subjects scatter widely from sample to sample."""
         return self.n_subjects < SMALL
 
     @cached_property
@@ -130,13 +130,16 @@ class RegressionResult(AnalysisResult):
             self.cohort, self.n_subjects, tests=(permutation, intervals) if self.permutations else (intervals,),
             assumptions=(
                 f"{self.target} is predicted by {self.choice.words()}, chosen in an inner cross-validation; all "
-                f"figures are of subjects left out in {self.folds} folds. R² is that of these predictions against the "
+                f"figures are of subjects held out in {self.folds} folds. R² is that of these predictions against the "
                 "mean of the training subjects, not a share of the sum of squares of shapes.",
             ),
         )  # fmt: skip
 
     def __repr__(self) -> str:
-        figures = [f"{name} {one.value:.3g} ({one.low:.3g} to {one.high:.3g})" for name, one in self.measures.items()]
+        figures = [
+            f"{name} {measure.value:.3g} ({measure.low:.3g} to {measure.high:.3g})"
+            for name, measure in self.measures.items()
+        ]
         tested = [] if self.p is None else [f"p {self.p:.3g}"]
         return (
             f"<RegressionResult of {describe_briefly(self.target)} on {len(self.cohort)} shapes of {self.n_subjects} "
@@ -164,27 +167,27 @@ def regress(
     drop_missing: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> RegressionResult:
-    """Predict a number from shape, and estimate the error of prediction on left-out subjects.
+    """Predict a number from shape, and estimate the error of prediction on held-out subjects.
 
     If completed shapes have samples, each imputation is analysed too; p, measures and predictions of the cohort combine
     them by Rubin's rules.
 
     Args:
-        cohort: the shapes.
+        cohort: cohort of the shapes.
         target: column of the number to predict.
         subject: column of the subjects, none of whom is on both sides of a fold (default: `subject`, if the table has
             it; otherwise each shape is of another subject).
         folds: number of folds of the outer cross-validation; the inner one has five.
         permutations: number of permutations for p; 0 for none.
-        draws: of subjects, for intervals of figures.
+        draws: number of random draws of subjects, for the intervals of measures.
         confidence: coverage of intervals.
-        seed: seed of folds and draws.
+        seed: seed of folds, permutations and draws.
         drop_missing: exclude shapes with missing values in the table (default: an error).
-        progress: called with (steps done, in all).
+        progress: function called with (steps done, in all).
 
     Raises:
         InputError: no such column, values that are missing, no numbers or all the same, fewer than ten subjects, fewer
-            subjects than folds, or options that cannot be.
+            subjects than folds, or invalid options.
     """
     require(cohort, Cohort, "regress", "read one with shapespace.read_cohort")
     _check_options(folds, permutations, draws, confidence, seed)
@@ -225,7 +228,7 @@ def regress(
         confidence=confidence,
         rng=rng,
     )
-    p = _p_of(
+    p = _permutation_p(
         X=X,
         y=y,
         codes=codes,
@@ -277,12 +280,12 @@ def regress(
 def compare_with(
     predictions: Predictions, observed: FloatArray, share: FloatArray | None = None
 ) -> tuple[float, float, float]:
-    """Return R2 (against the mean of the new shapes), RMSE and coverage of predictions where the target is known.
+    """Return R2 (against the mean of the new shapes), RMSE and coverage of predictions of known targets.
 
     Args:
-        predictions: of n shapes.
+        predictions: predictions of n shapes.
         observed: (n,) their targets.
-        share: (n,) weight of each shape, 1 / the number of scans of its subject; None for one scan of each.
+        share: (n,) weight of each shape, 1 / the number of scans of its subject; None if each subject has one scan.
     """
     share = np.ones(len(observed)) if share is None else share
     off = observed - predictions.value
@@ -296,7 +299,7 @@ def compare_with(
 
 
 def share_of(subjects: Sequence[str]) -> FloatArray:
-    """Return (N,) the weight of each scan: 1 / the number of scans of its subject."""
+    """Return the (N,) weight of each scan: 1 / the number of scans of its subject."""
     counts = Counter(subjects)
     return np.array([1.0 / counts[name] for name in subjects])
 
@@ -319,17 +322,17 @@ def _intervals(
     chosen: IndexArray,
     confidence: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return low and high (N,) of CV+ intervals of rows left out, by the inner folds of their training sets."""
+    """Return low and high (N,) of CV+ intervals of held-out rows, by the inner folds of their training sets."""
     low, high = np.empty_like(y), np.empty_like(y)
     for fold, own in enumerate(inner):
         test, train = outer == fold, outer != fold
         choice = CHOICES[int(chosen[fold])]
-        residuals, ways, _, _ = _left_out(X[train], y[train], share[train], own, choice, X[test])
+        residuals, ways, _, _ = _cross_validate(X[train], y[train], share[train], own, choice, X[test])
         low[test], high[test] = cv_plus(ways, residuals, own, share[train], confidence)
     return low, high
 
 
-def _left_out(
+def _cross_validate(
     X: FloatArray, y: FloatArray, share: FloatArray, folds: IndexArray, choice: Regularisation, new: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return residuals (N,) without each row's fold, predictions (n, F) of `new`, weights (F, K), intercepts (F,)."""
@@ -360,7 +363,7 @@ def _predictor(
     if choice.space == "whitened":
         choice = Regularisation("whitened", min(choice.amount, len(decomposition.singular)))
     beta, intercept = decomposition.weights(y, choice)
-    residuals, _, weights, intercepts = _left_out(X, y, share, outer, choice, X[:1])
+    residuals, _, weights, intercepts = _cross_validate(X, y, share, outer, choice, X[:1])
     middle = decomposition.middle
     all_beta, all_intercepts = np.vstack([beta, weights]), np.concatenate([[intercept], intercepts])
     farthest = float(np.sqrt(((X - middle) ** 2).sum(axis=1).max() / cohort.n_vertices))
@@ -396,7 +399,7 @@ def _measures(
     confidence: float,
     rng: np.random.Generator,
 ) -> dict[str, AccuracyMeasure]:
-    """Return all figures with their intervals, of which every draw is a weighing of subjects."""
+    """Return all measures with their intervals, in which each draw is a weighting of subjects."""
     n = int(codes.max()) + 1
     times = np.vstack([np.ones(n), rng.multinomial(n, np.full(n, 1.0 / n), draws)])
     off = y - predicted
@@ -426,7 +429,7 @@ def _measures(
     return {**measured, "coverage": AccuracyMeasure(inside.value, *map(float, ends))}
 
 
-def _p_of(
+def _permutation_p(
     X: FloatArray,
     y: FloatArray,
     codes: IndexArray,
@@ -438,13 +441,13 @@ def _p_of(
     rng: np.random.Generator,
     steps: StepCounter,
 ) -> float | None:
-    """Return the share of permutations, that observed among them, whose R2 is at least as high, each with its own
+    """Return the share of permutations, the observed order among them, whose R2 is at least as high, each with its own
     choice."""
     if not permutations:
         return None
     beyond = 1
     for start in range(0, permutations, _BLOCK):
-        targets = np.stack([_permuted(codes, y, rng) for _ in range(min(_BLOCK, permutations - start))], axis=1)
+        targets = np.stack([_permute_targets(codes, y, rng) for _ in range(min(_BLOCK, permutations - start))], axis=1)
         done = nested(X, targets, share, outer, inner, on_fold=lambda _done, _folds: steps.add())
         # S43
         r2 = 1.0 - (share @ (targets - done.predicted) ** 2) / (share @ (targets - done.baseline) ** 2)
@@ -452,7 +455,7 @@ def _p_of(
     return beyond / (1 + permutations)
 
 
-def _permuted(codes: IndexArray, y: FloatArray, rng: np.random.Generator) -> FloatArray:
+def _permute_targets(codes: IndexArray, y: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Return the targets (N,) permuted between subjects, and within them if they vary; see `permutation_scheme`."""
     counts = np.bincount(codes)
     rows = [np.flatnonzero(codes == subject) for subject in range(len(counts))]
@@ -474,7 +477,7 @@ def _is_constant(subjects: Sequence[str], y: FloatArray) -> bool:
 
 
 def permutation_scheme(subjects: Sequence[str], y: FloatArray) -> str:
-    """Return in a sentence which targets are exchanged under the null hypothesis of no relation with shape.
+    """Return a sentence that states which targets are exchanged under the null hypothesis of no relation with shape.
 
     Args:
         subjects: (N,) the subject of each row.

@@ -1,8 +1,8 @@
-"""Where new subjects lie in a reference population: distances, percentiles, maps, and what lies outside of it.
+"""Scores of new subjects against a reference population: distances, percentiles, maps, and off-model variation.
 
-Each subject of the reference is left out in turn and measured by the others in the same way as a new subject, so that
-the percentiles are valid for any distribution of the distances (Vovk, Gammerman and Shafer, Algorithmic Learning in a
-Random World, 2005; with refitting, Barber et al., Annals of Statistics 49(1), 2021).
+Each subject of the reference is held out in turn and scored against the others in the same way as a new subject, so
+that the percentiles are valid for any distribution of the distances (Vovk, Gammerman and Shafer, Algorithmic Learning
+in a Random World, 2005; with refitting, Barber et al., Annals of Statistics 49(1), 2021).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from shapespace.statistics.multiple_imputation import Imputations, over_imputati
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, read_only, require
 
 FEWEST_PEOPLE, SMALL = 5, 30
-"""The least reference, and one below which the answer says that it is small."""
+"""Smallest number of people of a reference, and the number below which the result notes that it is small."""
 
 LEVEL = 0.05  # share of people of the reference beyond the limit of the maps
 # share of variance of the modes, people per mode that estimate its variance, and folds (each costs a decomposition)
@@ -43,13 +43,13 @@ _OUTSIDE = 0.01  # share of the reference beyond a subject from which it is repo
 
 @dataclass(frozen=True, kw_only=True)
 class ScoreConfig:
-    """How subjects are measured by a reference.
+    """Options of the scores against a reference.
 
     Args:
         modes: number of modes of the reference (default: those of 95 % of its variance, at most one per five subjects).
         subject: column of the subjects in both tables, if subjects have several scans.
         nearest: number of nearest subjects of the reference to name.
-        draws: of the reference as it would look if it were seen as badly as a subject is.
+        draws: number of draws of the reference, each with the precision of the scored fit.
         seed: seed of the draws of uncertain fits.
         drop_missing: exclude shapes with missing values in the table (default: an error).
     """
@@ -64,7 +64,7 @@ class ScoreConfig:
 
 @dataclass(frozen=True, eq=False)
 class NearestReference:
-    """One of the reference beside a subject: its name, its distance in standard deviations, and the RMS in mm."""
+    """A person of the reference near a subject: name, distance in standard deviations, and RMS distance in mm."""
 
     name: str
     distance: float
@@ -73,36 +73,36 @@ class NearestReference:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScoreResult(AnalysisResult):
-    """Where M subjects lie in a reference of N scans of P people.
+    """Scores of M subjects against a reference of N scans of P people.
 
     Args:
-        names: of the subjects.
-        reference_names: N.
-        people: P.
-        modes: q, of the reference.
-        variance_share: of the reference's variance, in these modes.
+        names: names of the subjects.
+        reference_names: names of the N scans of the reference.
+        people: number P of people in the reference.
+        modes: number q of modes of the reference.
+        variance_share: share of the reference's variance in these modes.
         mean: the reference's mean shape, mm.
         distance: (M,) Mahalanobis distances in the modes, with each fit's own uncertainty.
-        farther: (M,) share of the reference's people, the subject among them, who lie as far out or farther when left
-            out, from 1 / (P + 1) to 1; a p value.
-        p_value: (M,) the same by the F distribution of normal shapes.
-        rest_mm: (M,) RMS over the vertices of what the modes cannot make, mm.
-        rest_farther: (M,) as `farther`, of that.
-        beyond_mm: (M,) RMS of what the fit's model left of its residuals, mm; NaN where that is not known.
-        beyond_farther: (M,) as `farther`, of that.
-        size_mm: (M,) centroid sizes; NaN where not known.
-        size_z: (M,) sizes in standard deviations of the reference's; NaN where not known.
+        farther: (M,) share of people as far out or farther when held out, among those of the reference and the subject,
+            from 1 / (P + 1) to 1; a p value.
+        p_value: (M,) p value of the distance by the F distribution of normal shapes.
+        rest_mm: (M,) RMS over the vertices of the variation outside the modes, mm.
+        rest_farther: (M,) as `farther`, for `rest_mm`.
+        beyond_mm: (M,) RMS of the residuals that the model of the fit does not explain, mm; NaN if not known.
+        beyond_farther: (M,) as `farther`, for `beyond_mm`; NaN if not known.
+        size_mm: (M,) centroid sizes; NaN if not known.
+        size_z: (M,) sizes in standard deviations of the reference's; NaN if not known.
         z: (M, V) displacement along the mean's normals in standard deviations, outwards positive; not-a-number where a
             subject's vertex is an estimate without samples.
-        z_limit: |z| below which 95 % of the reference's people stay everywhere when left out; NaN for fewer than 19.
-        nearest: for each subject those of the reference nearest to it.
-        outside: for each subject sentences on how it lies outside what reference or model know; none where it does not.
-        reference_distance: (N,) Mahalanobis distance of each of the reference by the others.
-        reference_rest_mm: (N,) as `rest_mm`.
-        subjects: the cohort of them.
+        z_limit: |z| below which 95 % of the reference's people stay everywhere when held out; NaN for fewer than 19.
+        nearest: nearest shapes of the reference, for each subject.
+        outside: sentences on how each subject lies outside the reference or the model; empty if it does not.
+        reference_distance: (N,) Mahalanobis distance of each shape of the reference from the others.
+        reference_rest_mm: (N,) as `rest_mm`, for each shape of the reference.
+        subjects: cohort of the scored subjects.
         config: options of the scoring.
-        notes: who was left out and why, and what should be known.
-        imputations: those that scores combine; None without samples of completed shapes.
+        notes: excluded shapes with the reasons, and further remarks.
+        imputations: imputations that scores combine; None without samples of completed shapes.
         review: number of the surfaces of reference and subjects that need review.
 
     Example:
@@ -191,10 +191,10 @@ def score(
     *,
     progress: Callable[[int, int], None] | None = None,
 ) -> ScoreResult:
-    """Return where `subjects` lie in the population that `reference` is a sample of.
+    """Return scores of `subjects` against the population that `reference` is a sample of.
 
     Distances are measured in q principal components of the reference, by its covariance there and the fit's own
-    uncertainty: d^2 = y' (S (1 + 1 / P) + D)^-1 y. For the percentiles each person of the reference is left out, made
+    uncertainty: d^2 = y' (S (1 + 1 / P) + D)^-1 y. For the percentiles each person of the reference is held out, made
     as uncertain as the subject, and measured by the others; of more than 100 people, a hundredth at a time.
 
     If completed shapes have samples, scores are means over the imputations, in the same number of modes, with a
@@ -204,11 +204,11 @@ def score(
         reference: N shapes.
         subjects: M shapes, read with `onto=reference`.
         config: options; None for the defaults.
-        progress: called with (done, total).
+        progress: function called with (done, total).
 
     Raises:
-        InputError: fewer than five people, more modes than there can be, cohorts of different models or gauges, a
-            subject who is in the reference, or something missing in the column that says who is scanned.
+        InputError: fewer than five people, too many modes, cohorts of different models or gauges, a subject who is in
+            the reference, or missing values in the column of subjects.
         CorrespondenceError: shapes of different vertices.
     """
     require(reference, Cohort, "score", "read one with shapespace.read_cohort")
@@ -217,14 +217,14 @@ def score(
     if config.subject is not None:
         reference = reference.complete([config.subject], drop_missing=config.drop_missing)
         subjects = subjects.complete([config.subject], drop_missing=config.drop_missing)
-    _refuse_unlike(reference, subjects)
+    _check_comparable(reference, subjects)
     modes = _modes(reference, _people(reference, config.subject), config.modes)
     return _score_shapes(reference, subjects, config, modes, progress=progress)
 
 
 def _update(result: ScoreResult) -> ScoreResult:
-    """Return scores whose sentences follow the combined ones."""
-    return replace(result, outside=tuple(tuple(_outside(result, k)) for k in range(len(result.names))))
+    """Return scores whose sentences agree with the combined scores."""
+    return replace(result, outside=tuple(tuple(_describe_outside(result, k)) for k in range(len(result.names))))
 
 
 @over_imputations(means=_MEANS, finish=_update)
@@ -236,16 +236,16 @@ def _score_shapes(
     *,
     progress: Callable[[int, int], None] | None,
 ) -> ScoreResult:
-    """Return the scores in a given number of modes; arguments as of `score`."""
+    """Return the scores in a given number of modes; for the arguments see `score`."""
     people = _people(reference, config.subject)
     own, outside_basis = _in_basis_of(reference, subjects)
-    _refuse_known(reference, subjects, own, outside_basis, config.subject)
+    _check_not_in_reference(reference, subjects, own, outside_basis, config.subject)
     population = _Population(reference, people, modes)
     theirs, ours = _FitUncertainty.of(reference), _FitUncertainty.of(subjects)
     notes = [*reference.notes, *(note for note in subjects.notes if note not in reference.notes)]
     if theirs is None or ours is None or not np.array_equal(theirs.prior, ours.prior):
         if reference.fitted is not None:
-            notes.append("How uncertain each fit is was not taken into account; that needs coefficients of fits.")
+            notes.append("The uncertainty of each fit was not taken into account; that needs coefficients of fits.")
         theirs = ours = None
     m, draws = len(subjects), _draws(theirs, config)
     measures = np.empty((5, m))
@@ -266,11 +266,11 @@ def _score_shapes(
             np.sqrt(own_d2), population.share(d2 >= own_d2), population.p_value(own_d2),
             own_rest, population.share(rest >= own_rest),
         )  # fmt: skip
-        nearest.append(_nearest(population, reference, own[k], outside_basis[k], noise, config.nearest))
+        nearest.append(_nearest_references(population, reference, own[k], outside_basis[k], noise, config.nearest))
         if progress is not None:
             progress(k + 1, m)
-    beyond = np.array([_beyond(subjects), np.full(m, np.nan)])
-    theirs_beyond = _beyond(reference)
+    beyond = np.array([_residual_rms_mm(subjects), np.full(m, np.nan)])
+    theirs_beyond = _residual_rms_mm(reference)
     if np.isfinite(theirs_beyond).all():
         for k in np.flatnonzero(np.isfinite(beyond[0])):
             beyond[1, k] = population.share(theirs_beyond[None] >= beyond[0, k])
@@ -287,12 +287,12 @@ def _score_shapes(
         beyond_farther=read_only(beyond[1]), size_mm=subjects.sizes_mm, size_z=read_only(size_z), z=z, z_limit=limit,
         nearest=tuple(nearest), outside=(), reference_distance=read_only(np.sqrt(own_d2[0])),
         reference_rest_mm=read_only(own_rest[0]), subjects=subjects, config=config,
-        review=reference.review + subjects.review, notes=(*notes, *_on_size(population.people)),
+        review=reference.review + subjects.review, notes=(*notes, *_size_notes(population.people)),
     )  # fmt: skip
-    return replace(scores, outside=tuple(tuple(_outside(scores, k)) for k in range(m)))
+    return replace(scores, outside=tuple(tuple(_describe_outside(scores, k)) for k in range(m)))
 
 
-def _refuse_unlike(reference: Cohort, subjects: Cohort) -> None:
+def _check_comparable(reference: Cohort, subjects: Cohort) -> None:
     if reference.n_vertices != subjects.n_vertices:
         raise CorrespondenceError(
             f"The subjects have {subjects.n_vertices} vertices and the reference {reference.n_vertices}; fit both with "
@@ -300,15 +300,15 @@ def _refuse_unlike(reference: Cohort, subjects: Cohort) -> None:
         )
     if reference.gauge != subjects.gauge:
         raise InputError(
-            f"The reference is in the gauge {reference.gauge}, the subjects in {subjects.gauge}; take one."
+            f"The reference is in the gauge {reference.gauge}, the subjects in {subjects.gauge}; use the same for both."
         )
     if (reference.fitted is None) != (subjects.fitted is None):
         raise InputError("Fits cannot be compared with other surfaces; fit both with one model.")
     if reference.fitted is not None and subjects.fitted is not None:
-        one, other = reference.fitted.model.content_hash, subjects.fitted.model.content_hash
-        if one != other:
+        own, other = reference.fitted.model.content_hash, subjects.fitted.model.content_hash
+        if own != other:
             raise InputError(
-                f"The subjects are fits by another model ({other[:12]}) than the reference ({one[:12]}); fit all scans "
+                f"The subjects are fits by another model ({other[:12]}) than the reference ({own[:12]}); fit all scans "
                 "with one model."
             )
 
@@ -327,7 +327,7 @@ def _people(reference: Cohort, column: str | None) -> IntArray:
 
 
 def _modes(reference: Cohort, people: IntArray, wanted: int | None) -> int:
-    """Return how many principal components of the reference carry distances."""
+    """Return the number of principal components of the reference in which distances are measured."""
     count = int(people.max()) + 1
     centred = reference.coefficients - reference.coefficients.mean(axis=0)
     variance = np.linalg.svd(centred, compute_uv=False) ** 2
@@ -342,33 +342,33 @@ def _modes(reference: Cohort, people: IntArray, wanted: int | None) -> int:
 
 
 def _in_basis_of(reference: Cohort, subjects: Cohort) -> tuple[FloatArray, FloatArray]:
-    """Return the subjects' coefficients (M, K) in the reference's basis, and the squares (M,) of what lies outside."""
+    """Return the subjects' coefficients (M, K) in the reference's basis, and the squares (M,) of the rest."""
     into = subjects.basis @ reference.basis.T
     shift = (subjects.reference - reference.reference).ravel()
     own = subjects.coefficients @ into + reference.basis @ shift
     squared = [float(np.sum((subjects.vertices(k) - reference.reference) ** 2)) for k in range(len(subjects))]
     left = np.array(squared) - (own**2).sum(axis=1)
-    # Below rounding it is nothing.
+    # A rest below rounding is zero.
     return own, np.where(left > 1e-12 * np.array(squared), left, 0.0)
 
 
-def _refuse_known(
+def _check_not_in_reference(
     reference: Cohort, subjects: Cohort, own: FloatArray, outside: FloatArray, column: str | None
 ) -> None:
-    """Refuse subjects whose scans, or other scans of them, are in the reference."""
+    """Check that neither the subjects' scans nor other scans of the same subjects are in the reference."""
     distance = cdist(own, reference.coefficients)
     near = np.sqrt(distance.min(axis=1) ** 2 + outside) < _SAME * centroid_size(reference.reference)
     if near.any():
         k = int(np.flatnonzero(near)[0])
         raise InputError(
             f"{subjects.names[k]} is in the reference too, as {reference.names[int(distance[k].argmin())]}"
-            f"{f', and {int(near.sum()) - 1} more are' if near.sum() > 1 else ''}; leave it out of one of them."
+            f"{f', and {int(near.sum()) - 1} more are' if near.sum() > 1 else ''}; exclude one of the two scans."
         )
     if column is not None:
         both = sorted({*reference.table.texts(column)} & {*subjects.table.texts(column)})
         if both:
             raise InputError(
-                f"{list_names(both)} of {column} is among the subjects and in the reference; leave out one scan."
+                f"{list_names(both)} of {column} is among the subjects and in the reference; exclude one scan."
             )
 
 
@@ -402,7 +402,7 @@ class _ShapeDistribution:
 
 
 class _Population:
-    """Distribution of the reference: of all people, and with each fold of people left out."""
+    """Distribution of the reference: of all people, and with each fold of people held out."""
 
     def __init__(self, reference: Cohort, people: IntArray, modes: int) -> None:
         self.people, self.modes = int(people.max()) + 1, modes
@@ -422,7 +422,7 @@ class _Population:
             self.folds.append((np.flatnonzero(inside).astype(np.int32), _ShapeDistribution.of(x[~inside], left, modes)))
 
     def left_out(self, coefficients: FloatArray, noise: FloatArray | None) -> tuple[FloatArray, FloatArray]:
-        """Return squared distances and RMS of the rest in mm, (R, N) each, of (R, N, K) measured by the others."""
+        """Return squared distances and RMS of the rest in mm, (R, N) each, of (R, N, K) held-out coefficients."""
         d2 = np.empty(coefficients.shape[:2])
         rest = np.empty_like(d2)
         for rows, measure in self.folds:
@@ -433,11 +433,11 @@ class _Population:
         return d2, rest
 
     def rms(self, squares: FloatArray) -> FloatArray:
-        """Return sums of squares as RMS over the vertices, mm; what is left by rounding alone is nothing."""
+        """Return sums of squares as RMS over the vertices, mm; a rest that is only rounding is zero."""
         return np.sqrt(np.where(squares > self.least, squares, 0.0) / self.n_vertices)
 
     def share(self, farther: BoolArray) -> float:
-        """Return the share of people, a new one among them, who are `farther` (R, N); those of a person count once."""
+        """Return the share of people, with a new person, who are `farther` (R, N); all scans of a person count once."""
         return (1 + float((farther.mean(axis=0) * self.weight).sum())) / (self.people + 1)  # S52
 
     def p_value(self, squared: float) -> float:
@@ -466,7 +466,7 @@ class _FitUncertainty:
 
     @staticmethod
     def of(cohort: Cohort) -> _FitUncertainty | None:
-        """Return the uncertainty of the fits of a cohort; None for other surfaces than the model's own."""
+        """Return the uncertainty of the fits of a cohort; None if the surfaces are not the model's own."""
         fitted = cohort.fitted
         if fitted is None or not np.isfinite(fitted.b_stddev).all():
             return None
@@ -485,7 +485,7 @@ class _FitUncertainty:
         return (self.into.T * self.variance[k]) @ self.into
 
     def typical(self) -> FloatArray:
-        """Return the same of a usual fit."""
+        """Return the covariance (K', K') of the coefficients of a typical fit."""
         return (self.into.T * np.median(self.variance, axis=0)) @ self.into
 
     def degraded(self, coefficients: FloatArray, shrinkage: FloatArray, draws: FloatArray) -> FloatArray:
@@ -493,7 +493,7 @@ class _FitUncertainty:
         ratio = np.minimum(shrinkage / self.shrinkage, 1.0)
         if ratio.min() > _EQUALLY_PRECISE:
             return coefficients[None]
-        # What a scan does not show is estimated by the model's mean, with the remaining scatter of such estimates.
+        # The model's mean replaces the part that a scan does not show, with the remaining scatter of such estimates.
         moved = (ratio - 1) * self.b + np.sqrt(self.prior * shrinkage * (1 - ratio)) * draws
         return coefficients + moved @ self.into
 
@@ -504,13 +504,13 @@ def _draws(uncertainty: _FitUncertainty | None, config: ScoreConfig) -> FloatArr
     return np.random.default_rng(config.seed).standard_normal((config.draws, *shape))
 
 
-def _beyond(cohort: Cohort) -> FloatArray:
+def _residual_rms_mm(cohort: Cohort) -> FloatArray:
     if cohort.fitted is None or cohort.fitted.beyond_mm is None:
         return np.full(len(cohort), np.nan)
     return cohort.fitted.beyond_mm
 
 
-def _nearest(
+def _nearest_references(
     population: _Population, reference: Cohort, own: FloatArray, outside: float, noise: FloatArray | None, count: int
 ) -> tuple[NearestReference, ...]:
     between = own - reference.coefficients
@@ -566,7 +566,7 @@ def _maps(
     return read_only(z), float(by_person[rank - 1]) if rank <= count else float("nan")
 
 
-def _on_size(people: int) -> list[str]:
+def _size_notes(people: int) -> list[str]:
     if people >= SMALL:
         return []
     step = 100 / (people + 1)
@@ -576,10 +576,10 @@ def _on_size(people: int) -> list[str]:
     ]
 
 
-def _outside(scores: ScoreResult, k: int) -> list[str]:
-    """Return sentences on how a subject lies outside what reference or model know."""
+def _describe_outside(scores: ScoreResult, k: int) -> list[str]:
+    """Return sentences on how a subject lies outside the reference or the model."""
     out: list[str] = []
-    # A small reference can say no more than that a subject lies beyond all of it.
+    # With a small reference, "beyond all of the reference" is the strongest possible statement.
     rare = max(_OUTSIDE, 1 / (scores.people + 1)) + 1e-9
 
     def beyond(share: float) -> str:

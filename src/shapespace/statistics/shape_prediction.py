@@ -1,4 +1,4 @@
-"""The mean shape as a function of a number, such as age, with intervals: a linear model in which each subject counts
+"""Mean shape as a function of a number, such as age, with intervals: a linear model in which each subject counts
 once."""
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from shapespace.reprs import list_briefly
 from shapespace.schemas import Methods, TestScheme
 from shapespace.statistics.compare_formula import Design, design_of, quoted
 from shapespace.statistics.compare_shapes import complete_cohort
-from shapespace.statistics.compare_strata import columns_of_terms, refuse_aliased
+from shapespace.statistics.compare_strata import check_not_aliased, columns_of_terms
 from shapespace.statistics.effect_size import permutation_p
 from shapespace.statistics.linear_regressors import IndexArray
 from shapespace.statistics.methods import AnalysisResult, methods_of
@@ -28,14 +28,14 @@ from shapespace.types import BoolArray, FloatArray, Mesh, read_only, require
 
 Curve: TypeAlias = Literal["linear", "spline"]
 FEWEST = 10
-"""Subjects, of each column of the number in the model, below which nothing is learned; with 6 of a column p is below
+"""Subjects per column of the number in the model, below which no shapes are predicted; with 6 per column p is below
 0.05 in up to 10 % of studies without an effect (docs/regress.md)."""
 _LEAST_DF = 3.0
 """Degrees of freedom below which an interval is not known: there it covers up to 99 % instead of 95 % (measured in
 docs/regress.md)."""
 _EDGES = (5.0, 95.0)  # percentiles of the number between which the change of shape is measured
 _VALUES, _STEPS = 5, 21
-"""Values without `at`, and values at which a slider has a shape."""
+"""Number of values without `at`, and number of values at which a slider has a shape."""
 _TERMS: Mapping[Curve, str] = {"linear": "{}", "spline": "cr({}, df=2)"}
 
 
@@ -44,11 +44,11 @@ class PredictedMeasure:
     """The mean of a size or a length at each value.
 
     Args:
-        name: such as `centroid size`.
-        observed: (N,) of the shapes, mm.
-        value: (A,) mm.
-        low: (A,) ends of pointwise intervals; NaN where they are not known.
-        high: (A,) likewise.
+        name: name of the measure, such as `centroid size`.
+        observed: (N,) values of the shapes, mm.
+        value: (A,) predicted mean, mm.
+        low: (A,) lower ends of pointwise intervals, mm; NaN if not known.
+        high: (A,) upper ends of pointwise intervals, mm; NaN if not known.
 
     Example:
         >>> shapes = ss.statistics.predict_shapes(cohort, "age", permutations=99)
@@ -68,26 +68,29 @@ class ShapePrediction(AnalysisResult):
     """Mean shapes along a number.
 
     Args:
-        cohort: the N shapes, those of a subject one after the other.
-        along: the number.
-        observed: (N,) of it.
-        formula: of the linear model.
-        other_terms: of it, without the number.
-        held: values of other variables, by their names; others are at their mean, classes count alike.
-        values: (A,) ascending, at which shapes are predicted.
-        ends: 5th and 95th percentile of the number, or the values beyond; the change of shape is that between them.
-        coefficients: (A, K) of the mean shapes, mm.
+        cohort: cohort of the N shapes, those of a subject one after the other.
+        along: column of the number.
+        observed: (N,) values of the number.
+        formula: formula of the linear model.
+        other_terms: terms of the model without the number.
+        held: fixed values of other variables, by their names; other numbers are at their mean, classes have equal
+            weights.
+        values: (A,) values at which shapes are predicted, ascending.
+        ends: 5th and 95th percentile of the number, or more extreme values of `values`; the change of shape is between
+            them.
+        coefficients: (A, K) coefficients of the mean shapes, mm.
         parts: (A + 1, S, K) part of each of the S subjects in the error of each shape, and of the change between the
             ends, mm; their squares sum to the variance.
         df: (A + 1,) degrees of freedom of these variances.
-        steps: (B,) ascending from end to end, with
-        path: (B, K) the mean shapes there.
+        steps: (B,) values of the number from end to end, ascending.
+        path: (B, K) coefficients of the mean shapes at `steps`, mm.
         measures: centroid size, if it is known, and lengths.
-        p: that shape does not depend on the number, by sign flips of the residuals of subjects; None without.
-        subject: column of the subjects; None if each shape is of another one.
+        p: p of the hypothesis that shape does not depend on the number, by sign flips of the residuals of subjects;
+            None without permutations.
+        subject: column of the subjects; None if each shape is of another subject.
         confidence: coverage of intervals.
         permutations: number of sign flips, including the observed data.
-        seed: of these.
+        seed: seed of the sign flips.
 
     Example:
         >>> shapes = ss.statistics.predict_shapes(cohort, "age", permutations=99)
@@ -143,7 +146,7 @@ class ShapePrediction(AnalysisResult):
     @property
     def change_mm(self) -> tuple[float, float]:
         """Change of shape between the ends and its standard error, RMS over vertices."""
-        change, error = (np.linalg.norm(one) for one in (self.path[-1] - self.path[0], self.parts[-1]))
+        change, error = (np.linalg.norm(vector) for vector in (self.path[-1] - self.path[0], self.parts[-1]))
         return float(change / self.cohort.n_vertices**0.5), float(error / self.cohort.n_vertices**0.5)
 
     @cached_property
@@ -158,7 +161,7 @@ class ShapePrediction(AnalysisResult):
         """Return half the width of the pointwise interval of the mean shape at value `k`, or of the change for A.
 
         Returns:
-            (V,) along the normals; (V, 3) along the axes for landmarks; NaN where it is not known.
+            (V,) along the normals; (V, 3) along the axes for landmarks; NaN if it is not known.
         """
         width = _interval_factor(self.df, self.confidence)[k] * np.linalg.norm(
             self.parts[k] @ self._directions, axis=0
@@ -215,13 +218,13 @@ def predict_shapes(
     `size` and `log_size`, the centroid size in mm and its logarithm, are available as columns too.
 
     Args:
-        cohort: the shapes.
+        cohort: cohort of the shapes.
         along: column of the number along which shapes are predicted, such as age.
-        at: values of the number, within those observed (default: five from the 5th to the 95th percentile).
-        curve: how shape depends on the number: `linear`, or `spline`, a natural cubic spline with a knot at the median
-            (default: linear).
+        at: values of the number, within the observed range (default: five from the 5th to the 95th percentile).
+        curve: dependence of shape on the number: `linear`, or `spline`, a natural cubic spline with a knot at the
+            median (default: linear).
         covariates: further terms of the linear model, such as 'sex + site' or 'sex + age:sex'.
-        hold: values at which other columns are held (default: numbers at their mean, and classes count alike).
+        hold: fixed values of other columns (default: numbers at their mean, and equal weights of classes).
         lengths: pairs of landmarks whose distance is predicted too.
         subject: column of the subjects, each of whom counts once (default: `subject`, if the table has it; otherwise
             each shape is of another subject).
@@ -229,11 +232,11 @@ def predict_shapes(
         permutations: number of sign flips for p, including the observed data; 0 for none.
         seed: seed of the sign flips.
         drop_missing: exclude shapes with missing values in the table (default: an error).
-        progress: called with (done, total).
+        progress: function called with (done, total).
 
     Raises:
-        InputError: no such column or landmark, missing values, a number that is constant or holds classes, values that
-            were not observed, fewer than ten subjects, a model that cannot be estimated, or options that cannot be.
+        InputError: no such column or landmark, missing values, a number that is constant or contains classes, values
+            outside the observed range, fewer than ten subjects, a model that cannot be estimated, or invalid options.
         ShapespaceError: the extra `statistics` is not installed.
     """
     require(cohort, Cohort, "predict_shapes", "read one with shapespace.read_cohort")
@@ -252,7 +255,7 @@ def predict_shapes(
     owner = np.unique(subjects_of(cohort, subject), return_inverse=True)[1].astype(np.intp)
     where, x = cohort.table.where, _numbers(cohort, along)
     design = design_of(formula, cohort.table)
-    variable = next(one for one in design.variables if one.name == along)
+    variable = next(variable for variable in design.variables if variable.name == along)
     own = [1 + column for term in design.terms if variable.column in term.variables for column in term.columns]
     least = max(FEWEST * len(own), design.matrix.shape[1] + 3)
     if 1 + owner[-1] < least:
@@ -260,8 +263,8 @@ def predict_shapes(
             f"{where}: {1 + owner[-1]} subjects are too few to predict shapes along {along} by {formula!r}; {least} "
             "are the least."
         )
-    refuse_aliased(design.matrix - design.matrix.mean(axis=0), columns_of_terms(design.terms), design.terms, design)
-    held = _held(design, hold or {}, along, where)
+    check_not_aliased(design.matrix - design.matrix.mean(axis=0), columns_of_terms(design.terms), design.terms, design)
+    held = _held_values(design, hold or {}, along, where)
     edges = percentiles(x, owner, _EDGES)
     between = [float(f"{value:.3g}") for value in np.linspace(*edges, _VALUES)]
     values = np.unique(np.asarray(at if len(at) else np.clip(between, x.min(), x.max()), dtype=np.float64))
@@ -285,7 +288,7 @@ def predict_shapes(
         observed=x,
         formula=formula,
         other_terms=tuple(term.label for term in design.terms if variable.column not in term.variables),
-        held={one.name: held[one.column] for one in design.variables if one.column in held},
+        held={other.name: held[other.column] for other in design.variables if other.column in held},
         values=read_only(values),
         ends=ends,
         coefficients=read_only(predicted[:-1]),
@@ -303,7 +306,7 @@ def predict_shapes(
 
 
 def _interval_factor(df: FloatArray, confidence: float) -> FloatArray:
-    """Return half the widths of intervals in standard errors; NaN where they are not known."""
+    """Return half the widths of intervals in standard errors; NaN if not known."""
     from scipy.stats import t  # loads much
 
     return np.where(df >= _LEAST_DF, t.ppf((1 + confidence) / 2, df), np.nan)
@@ -316,14 +319,14 @@ def percentiles(y: FloatArray, codes: IndexArray, percent: tuple[float, float]) 
     """
     weights: dict[tuple[float, int], float] = {}
     share = 1.0 / np.bincount(codes)[codes]
-    for value, subject, one in zip(y.tolist(), codes.tolist(), share.tolist(), strict=True):
-        weights[value, subject] = weights.get((value, subject), 0.0) + one
+    for value, subject, part in zip(y.tolist(), codes.tolist(), share.tolist(), strict=True):
+        weights[value, subject] = weights.get((value, subject), 0.0) + part
     own = sorted(weights)
     weight = np.array([weights[key] for key in own])
     midpoint = np.cumsum(weight) - 0.5 * (weight + 1.0)
     last = float(weight.sum()) - 1.0
     values = np.array([value for value, _ in own])
-    low, high = (float(np.interp(one / 100.0 * last, midpoint, values)) for one in percent)
+    low, high = (float(np.interp(percentile / 100.0 * last, midpoint, values)) for percentile in percent)
     return low, high
 
 
@@ -332,7 +335,7 @@ def _numbers(cohort: Cohort, along: str) -> FloatArray:
     where = cohort.table.where
     if cohort.table.kind(along) == "text":
         raise InputError(
-            f"{where}: {along!r} holds classes, and shapes are predicted along a number; compare classes with "
+            f"{where}: {along!r} contains classes, and shapes are predicted along a number; compare classes with "
             "shapespace compare."
         )
     x = cohort.table.numbers(along)
@@ -344,24 +347,28 @@ def _numbers(cohort: Cohort, along: str) -> FloatArray:
     return x
 
 
-def _held(design: Design, hold: Mapping[str, str | float], along: str, where: str) -> dict[str, str | float]:
-    """Return the values at which variables are held, by their names inside."""
-    known = {one.name.removeprefix("C(").removesuffix(")"): one for one in design.variables if one.name != along}
+def _held_values(design: Design, hold: Mapping[str, str | float], along: str, where: str) -> dict[str, str | float]:
+    """Return the fixed values of variables, by their internal names."""
+    known = {
+        variable.name.removeprefix("C(").removesuffix(")"): variable
+        for variable in design.variables
+        if variable.name != along
+    }
     held: dict[str, str | float] = {}
     for name, value in hold.items():
         if name not in known:
             raise InputError(f"{name!r} cannot be held; the other columns of the model are: {', '.join(known)}.")
-        one, number = known[name], design.values[known[name].column]
-        if one.levels:
-            if str(value) not in one.levels:
-                raise InputError(f"{where}: {name} is {', '.join(one.levels)}, and cannot be held at {value!r}.")
-            held[one.column] = str(value)
+        variable, number = known[name], design.values[known[name].column]
+        if variable.levels:
+            if str(value) not in variable.levels:
+                raise InputError(f"{where}: {name} is {', '.join(variable.levels)}, and cannot be held at {value!r}.")
+            held[variable.column] = str(value)
             continue
         observed = np.asarray(number, dtype=np.float64)
         try:
-            held[one.column] = float(value)
+            held[variable.column] = float(value)
         except ValueError as error:
-            raise InputError(f"{name} holds numbers, and cannot be held at {value!r}.") from error
+            raise InputError(f"{name} is a column of numbers, and cannot be held at {value!r}.") from error
         if not observed.min() <= float(value) <= observed.max():
             raise InputError(
                 f"{where}: {name} is observed from {observed.min():.6g} to {observed.max():.6g}, and cannot be held at "

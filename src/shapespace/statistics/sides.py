@@ -1,4 +1,4 @@
-"""The sides of an object: which vertices mirror which, found from the mean or given, and shapes beside their images."""
+"""Sides of symmetric objects: pairs of mirrored vertices, given or found from the mean, and images of shapes."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks
 
 LARGEST_PAIRED_OFF = 0.1
-"""The same where pairs are given, from vertex to vertex."""
+"""Largest `off_share` of given pairs, from vertex to vertex."""
 _LARGEST_BYTES = 2**26  # bytes; a table of pairs of millions of vertices is smaller
 _FEWEST = 4  # vertices, two pairs: one pair leaves the plane of symmetry to chance
 _MIRROR_IMAGE = 0.5
-"""The two sides are mirror images if reflection reduces the distance of their means to this share."""
+"""The two sides are mirror images if reflection reduces the distance of their means to this share or below."""
 _NUMBER = re.compile(r"[0-9]{1,12}")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Sides:
-    """Which place of an object is the mirror image of which.
+    """Mirror image of each vertex of an object.
 
     Args:
-        vertices: (M,) of the cohort that take part.
-        faces: (F, 3) triangles between them; None where there are none.
-        corners: (M, 3) of those M, whose mix is the other side of each.
-        weights: (M, 3) of them; where vertices pair up the first is 1.
-        paired: whether they do, so that the mirror image of the mirror image is the shape itself.
+        vertices: (M,) vertices of the cohort that take part.
+        faces: (F, 3) triangles between these vertices; None without triangles.
+        corners: (M, 3) numbers among the M vertices; their weighted mean is the mirror image of each vertex.
+        weights: (M, 3) weights of the corners; where vertices pair up the first is 1.
+        paired: whether vertices pair up, so that the mirror image of the mirror image is the shape itself.
         off_share: RMS distance of the mean from its mirror image, or of the means of two sides, as a share of its size.
-        notes: what should be known of them, a sentence each.
+        notes: remarks for the user, a sentence each.
         space: dimensions of the coordinates: 2 for planar landmarks.
-        classes: the two sides where they are separate shapes (matching symmetry); empty for symmetric objects.
+        classes: the two sides if they are separate shapes (matching symmetry); empty for symmetric objects.
     """
 
     vertices: IntArray
@@ -71,15 +71,15 @@ class Sides:
         return sum(self.weights[:, c, None] * fields[..., self.corners[:, c], :] for c in range(3)) * FLIP
 
     def chord_heights(self, mean: FloatArray, normals: FloatArray) -> FloatArray:
-        """Return how far (M,) the curved surface lies outside its triangle where each vertex has its mirror image.
+        """Return the height (M,) of the curved surface above its triangle at the mirror image of each vertex.
 
-        Each vertex lies on the surface, and would seem to stand further out than the other side. Near the plane, where
-        sides hardly vary, that would pass for directional asymmetry. The height is exact for quadratic surfaces: half
+        Each vertex lies on the surface, and would seem to be further out than the other side. Near the plane, where
+        sides hardly vary, this would look like directional asymmetry. The height is exact for quadratic surfaces: half
         of the projection of Boubekeur and Alexa (Phong tessellation, 2008).
 
         Args:
-            mean: (M, 3) mm.
-            normals: (M, 3) of it.
+            mean: (M, 3) vertices of the mean, mm.
+            normals: (M, 3) normals of the mean.
         """
         image = np.einsum("mc,mcd->md", self.weights, mean[self.corners])
         return 0.5 * np.einsum(
@@ -88,16 +88,16 @@ class Sides:
 
     @cached_property
     def on_the_plane(self) -> float:
-        """How many vertices are their own mirror image; in shares where places are mixed."""
+        """Number of vertices that are their own mirror image; vertices with a weighted mean count by their weight."""
         return float((self.weights * (self.corners == np.arange(len(self))[:, None])).sum())
 
     def dimensions(self, *, scaled: bool) -> tuple[float, float]:
-        """Return how many dimensions symmetric and asymmetric variation have, poses divided out.
+        """Return the numbers of dimensions of symmetric and asymmetric variation, without those of pose.
 
         With l pairs and k vertices on the plane they are 3 l + 2 k less 3, and 3 l + k less 3; of planar landmarks
-        2 l + k less 1, and 2 l + k less 2. Symmetric variation loses one more where size is divided out (Klingenberg,
-        Barluenga and Meyer 2002, table 2). Where vertices do not pair up, displacements along the normals count, of
-        which those on the plane are symmetric. Separate sides have all dimensions of a shape.
+        2 l + k less 1, and 2 l + k less 2. Symmetric variation has one less if size is divided out (Klingenberg,
+        Barluenga and Meyer 2002, table 2). If vertices do not pair up, displacements along the normals count; those on
+        the plane are symmetric. Separate sides have all dimensions of a shape.
 
         Args:
             scaled: whether size is divided out.
@@ -112,10 +112,10 @@ class Sides:
 
 
 def find_sides(cohort: Cohort) -> Sides:
-    """Return the sides of an object by the mean of its cohort, or the mean of the model of fits.
+    """Return the sides of an object from the mean of its cohort, or from the mean of the model of fits.
 
     Raises:
-        InputError: it has no triangles, or it is not its own mirror image about any plane.
+        InputError: it has no triangles, or it is not symmetric about any plane.
     """
     if cohort.faces is None:
         raise InputError("Landmarks and other points without triangles need --pairs, which names those that mirror "
@@ -123,7 +123,7 @@ def find_sides(cohort: Cohort) -> Sides:
     if (known := pairs_of_triangles(cohort.faces, cohort.n_vertices)) is not None:
         rows = list(zip(range(len(known)), known.tolist(), strict=True))
         return given_sides(cohort, rows, "The pairs of the symmetric template")
-    # A model is made of more shapes than most cohorts hold, so its mean is the more symmetric one.
+    # A model has more training shapes than most cohorts, so its mean is more symmetric.
     mean = cohort.reference if cohort.fitted is None else cohort.fitted.model.mean_vertices
     mesh = Mesh(mean, cohort.faces, name="mean")
     symmetry = find_mirror(mesh)
@@ -137,17 +137,17 @@ def find_sides(cohort: Cohort) -> Sides:
     rival = min(symmetry.others_share, default=np.inf)
     if rival <= SYMMETRIC_SHARE:
         notes.append(
-            f"The mean has another plane of symmetry, {100 * rival:.2f} % of its size off beside "
+            f"The mean has another plane of symmetry, {100 * rival:.2f} % of its size off compared with "
             f"{100 * symmetry.off_share:.2f} %; if that is the one you mean, name the pairs with --pairs."
         )
     everything = np.arange(cohort.n_vertices, dtype=np.int32)
     other = mirror_pairs(mesh, symmetry)
     if other is not None:
-        return _paired(everything, cohort.faces, other, off_share=symmetry.off_share, notes=tuple(notes))
+        return _paired_sides(everything, cohort.faces, other, off_share=symmetry.off_share, notes=tuple(notes))
     notes.append(
-        "The vertices of the mean do not pair up, so each is compared with the place nearest to its mirror image; what "
-        "the mean's sides differ by along the surface cannot be seen so, and the Procrustes ANOVA takes differences "
-        "along the normals alone."
+        "The vertices of the mean do not pair up, so each is compared with the place nearest to its mirror image; "
+        "differences between the mean's sides along the surface cannot be detected, and the Procrustes ANOVA uses only "
+        "differences along the normals."
     )
     return Sides(
         vertices=everything, faces=cohort.faces, corners=symmetry.corners, weights=symmetry.weights, paired=False,
@@ -156,18 +156,18 @@ def find_sides(cohort: Cohort) -> Sides:
 
 
 def given_sides(cohort: Cohort, pairs: Sequence[tuple[int, int]], where: str = "The pairs") -> Sides:
-    """Return the sides that pairs of vertices give.
+    """Return the sides that are defined by pairs of vertices.
 
-    Of a cohort of landmarks the others lie on the plane of symmetry, as in geomorph; other vertices are left out.
+    In a cohort of landmarks those in no pair lie on the plane of symmetry, as in geomorph; other vertices are excluded.
 
     Args:
-        cohort: of the shapes.
-        pairs: of vertices; one on the plane stands beside itself.
-        where: what the pairs are called in messages.
+        cohort: cohort of the shapes.
+        pairs: pairs of vertices; a vertex on the plane is paired with itself.
+        where: name of the pairs in messages.
 
     Raises:
-        InputError: vertices that do not exist or stand in two pairs, fewer than four, or pairs about which the mean is
-            nowhere near its mirror image.
+        InputError: vertices that do not exist or are in two pairs, fewer than four, or pairs about which the mean is
+            far from its mirror image.
     """
     other: dict[int, int] = {}
     is_landmarks = cohort.source.kind == "landmarks"
@@ -181,7 +181,7 @@ def given_sides(cohort: Cohort, pairs: Sequence[tuple[int, int]], where: str = "
                 )
         if other.get(a, b) != b or other.get(b, a) != a:
             twice = (a if other.get(a, b) != b else b) + first
-            raise InputError(f"{where}: the {noun} {twice} stands in two pairs; keep one.")
+            raise InputError(f"{where}: the {noun} {twice} is in two pairs; keep one.")
         other[a], other[b] = b, a
     notes: tuple[str, ...] = ()
     single = [v for v in range(cohort.n_vertices) if v not in other]
@@ -192,7 +192,7 @@ def given_sides(cohort: Cohort, pairs: Sequence[tuple[int, int]], where: str = "
                  f"({list_names([of.get(v, str(v + 1)) for v in single])}).",)  # fmt: skip
     if len(other) < _FEWEST:
         raise InputError(
-            f"{where} name {len(other)} vertices, and {_FEWEST} are the least that show a plane; add some."
+            f"{where} name {len(other)} vertices, and {_FEWEST} are the least that define a plane; add some."
         )
     vertices = np.array(sorted(other), dtype=np.int32)
     number = {int(v): k for k, v in enumerate(vertices)}
@@ -201,13 +201,13 @@ def given_sides(cohort: Cohort, pairs: Sequence[tuple[int, int]], where: str = "
     own[vertices] = np.arange(len(vertices))
     faces = np.zeros((0, 3), dtype=np.int32) if cohort.faces is None else own[cohort.faces]
     faces = faces[(faces >= 0).all(axis=1)]
-    sides = _paired(vertices, faces if len(faces) else None, partner, off_share=0.0, space=cohort.dimensions)
+    sides = _paired_sides(vertices, faces if len(faces) else None, partner, off_share=0.0, space=cohort.dimensions)
     x = cohort.reference[vertices]
     image = sides.image(x)
     try:
         off = float(np.sqrt(((fit_similarity(image, x, with_scale=False).apply(image) - x) ** 2).sum(axis=1).mean()))
     except InputError as error:
-        raise InputError(f"{where} lie on a line, so they show no plane; add pairs beside it.") from error
+        raise InputError(f"{where} lie on a line, so they define no plane; add pairs off the line.") from error
     share = off / rms_size(x)
     if share > LARGEST_PAIRED_OFF:
         raise InputError(
@@ -215,7 +215,7 @@ def given_sides(cohort: Cohort, pairs: Sequence[tuple[int, int]], where: str = "
             f"{100 * LARGEST_PAIRED_OFF:.0f} % is the most; check that each row names points that mirror each other."
         )
     left = cohort.n_vertices - len(vertices)
-    notes += (f"{left} of {cohort.n_vertices} vertices stand in no pair of {where} and are left out.",) if left else ()
+    notes += (f"{left} of {cohort.n_vertices} vertices are in no pair of {where} and are excluded.",) if left else ()
     return replace(sides, off_share=share, notes=notes)
 
 
@@ -223,7 +223,7 @@ def match_sides(cohort: Cohort, subject: str | None, side: str) -> tuple[Cohort,
     """Return pairs of shapes of the two sides of each subject, its repeated shapes in the order of the table.
 
     Args:
-        cohort: of separate left and right shapes, one side reflected.
+        cohort: cohort of separate left and right shapes, one side reflected.
         subject: column of the subjects; None for `subject`.
         side: column of the sides.
 
@@ -241,7 +241,9 @@ def match_sides(cohort: Cohort, subject: str | None, side: str) -> tuple[Cohort,
         )
     rows: tuple[list[int], list[int]] = [], []
     for owner in dict.fromkeys(owners):
-        own = [[k for k, cell in enumerate(cells) if cell == one and owners[k] == owner] for one in classes]
+        own = [
+            [k for k, cell in enumerate(cells) if cell == side_class and owners[k] == owner] for side_class in classes
+        ]
         for both, part in zip(rows, own, strict=True):
             both += part[: min(map(len, own))]
     if not rows[0]:
@@ -252,7 +254,7 @@ def match_sides(cohort: Cohort, subject: str | None, side: str) -> tuple[Cohort,
         if len(left) > 1
         else " without a counterpart on the other side is"
     )
-    note = f"{len(left)} shape{verb} left out ({list_names(left)})."
+    note = f"{len(left)} shape{verb} excluded ({list_names(left)})."
     one, other = (cohort.vertices(cohort.coefficients[part].mean(axis=0)) for part in rows)
 
     def off(image: FloatArray) -> float:
@@ -264,7 +266,7 @@ def match_sides(cohort: Cohort, subject: str | None, side: str) -> tuple[Cohort,
             f"alignment, landmarks with shapespace align --reflect {side}={classes[1]}."
         )
     everything = np.arange(cohort.n_vertices, dtype=np.int32)
-    sides = _paired(
+    sides = _paired_sides(
         everything, cohort.faces, everything, off_share=off(other) / float(np.linalg.norm(one - one.mean(axis=0))),
         notes=(note,) if left else (), space=cohort.dimensions, classes=classes,
     )  # fmt: skip
@@ -287,14 +289,14 @@ def aligned_shapes(cohort: Cohort, shapes: FloatArray) -> FloatArray:
 
 
 def read_pairs(path: Path, cohort: Cohort) -> tuple[tuple[int, int], ...]:
-    """Return the pairs in a CSV table of two columns, with a header or without, as names of landmarks or as numbers.
+    """Return the pairs in a CSV table of two columns, with or without a header, as names of landmarks or as numbers.
 
     Vertices count from 0, and landmarks of a cohort of landmarks from 1, as in geomorph. A cell that is the name of a
-    landmark is not read as a number. A first column without a name, which R writes for the rows, is left out.
+    landmark is not read as a number. A first column without a name, which R writes for the rows, is ignored.
 
     Raises:
-        FileError: it cannot be read.
-        FileFormatError: it is no such table.
+        FileError: the file cannot be read.
+        FileFormatError: the file is no such table.
         InputError: a name that is no landmark of the cohort.
     """
     check_file(path, _LARGEST_BYTES, "give a smaller table")
@@ -317,8 +319,8 @@ def read_pairs(path: Path, cohort: Cohort) -> tuple[tuple[int, int], ...]:
     return tuple((a, b) for a, b in pairs)
 
 
-def _paired(vertices: IntArray, faces: IntArray | None, partner: IntArray, **known: Any) -> Sides:
-    """Return sides of which the mirror image of each vertex (M,) is its partner (M,), by number among them."""
+def _paired_sides(vertices: IntArray, faces: IntArray | None, partner: IntArray, **known: Any) -> Sides:
+    """Return sides in which the mirror image of each vertex (M,) is its partner (M,), a number among the M vertices."""
     weights = np.zeros((len(partner), 3))
     weights[:, 0] = 1.0
     corners = np.tile(partner[:, None], (1, 3))

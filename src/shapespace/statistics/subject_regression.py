@@ -3,7 +3,7 @@
 The variance of an estimate sums over subjects, each with residuals of its own, corrected for their leverage (bias-
 reduced linearization, CR2: Bell and McCaffrey, Survey Methodology 28, 2002), and Student's t has the degrees of freedom
 of this variance (Imbens and Kolesar, Review of Economics and Statistics 98, 2016). Terms are tested by sign flips of
-the residuals of whole subjects (the restricted wild bootstrap of `dispersion`). Equations Sn: docs/regress.md.
+the residuals of all scans of a subject (the restricted wild bootstrap of `dispersion`). Equations Sn: docs/regress.md.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class SubjectRegression:
     """A linear model of rows, which are scans of subjects.
 
     Args:
-        columns: (N, p) of the model, independent, the constant among them.
+        columns: (N, p) columns of the model, independent, the constant among them.
         owner: (N,) number of the subject of each row, ascending from 0.
     """
 
@@ -49,7 +49,7 @@ class SubjectRegression:
         return np.asarray(1.0 / np.sqrt(np.bincount(self.owner)[self.owner]), dtype=np.float64)
 
     def predict(self, rows: FloatArray, responses: FloatArray) -> FloatArray:
-        """Return linear combinations (A, K) of the parameters; arguments as of `estimate`."""
+        """Return linear combinations (A, K) of the parameters; for the arguments see `estimate`."""
         return rows @ np.linalg.lstsq(self.root[:, None] * self.columns, self.root[:, None] * responses, rcond=None)[0]
 
     def estimate(self, rows: FloatArray, responses: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -57,7 +57,7 @@ class SubjectRegression:
 
         Args:
             rows: (A, p) combinations of the columns.
-            responses: (N, K).
+            responses: (N, K) responses.
 
         Returns:
             Estimates (A, K); the part of each of the S subjects in their error (A, S, K), whose squares sum to the
@@ -70,7 +70,7 @@ class SubjectRegression:
         weighted = self.root[:, None] * responses
         residual = weighted - q @ (q.T @ weighted)
         weights = np.asarray(q @ np.linalg.solve(r.T, rows.T), dtype=np.float64)  # S44
-        corrected = self._corrected(weights, q)
+        corrected = self._correct_leverage(weights, q)
         parts = np.stack([self._sums(column[:, None] * residual) for column in corrected.T])  # S45
         df = np.empty(len(rows))
         for k, column in enumerate(corrected.T):
@@ -84,14 +84,14 @@ class SubjectRegression:
     ) -> FloatArray:
         """Return the (permutations,) squared effects of some columns divided by their variance, the observed one first.
 
-        The others are those of sign flips of the residuals of the model without these columns.
+        Further values are those of sign flips of the residuals of the model without these columns.
 
         Args:
             tested: numbers of the columns.
-            responses: (N, K).
+            responses: (N, K) responses.
             permutations: number of sign flips, the observed data among them.
-            seed: of these.
-            progress: called with (done, total).
+            seed: seed of the sign flips.
+            progress: function called with (done, total).
 
         Raises:
             InputError: a subject that the model fits exactly.
@@ -100,7 +100,7 @@ class SubjectRegression:
         q = np.linalg.qr(self.root[:, None] * self.columns[:, [*others, *tested]])[0]
         reduced, weighted = q[:, : len(others)], self.root[:, None] * responses
         residual = weighted - reduced @ (reduced.T @ weighted)
-        corrected = self._corrected(q[:, len(others) :], q)
+        corrected = self._correct_leverage(q[:, len(others) :], q)
         between = self._sums(corrected[:, :, None] * q[:, None])
         products = np.einsum("gjm,gjn->mn", between, between)
 
@@ -113,7 +113,7 @@ class SubjectRegression:
             return (fitted[:, len(others) :] ** 2).sum(axis=(1, 2)) / np.maximum(variance, 1e-300)  # S48
 
         count, step = len(self._starts), StepCounter(permutations, progress)
-        found, scaled = [statistic(residual, np.ones((1, count)))], self._corrected(residual, reduced)
+        found, scaled = [statistic(residual, np.ones((1, count)))], self._correct_leverage(residual, reduced)
         for start in range(1, permutations, _BATCH):
             signs = np.random.default_rng([seed, _STREAM, start]).choice((-1.0, 1.0), (_BATCH, count))
             found.append(statistic(scaled, signs[: permutations - start]))
@@ -124,7 +124,7 @@ class SubjectRegression:
         """Return the sums of rows (N, ...) over each subject."""
         return np.add.reduceat(values, self._starts, axis=0)
 
-    def _corrected(self, values: FloatArray, columns: FloatArray) -> FloatArray:
+    def _correct_leverage(self, values: FloatArray, columns: FloatArray) -> FloatArray:
         """Return rows (N, c), those of each subject times the inverse root of 1 less its part of the hat matrix."""
         out = np.empty_like(values)
         for first, last in pairwise([*self._starts, len(values)]):
@@ -133,7 +133,7 @@ class SubjectRegression:
             if free[0] < FULL_LEVERAGE:
                 raise InputError(
                     "The model fits a subject exactly, as the only member of a class, so its variance is not known; "
-                    "leave the subject out, or merge its class with another."
+                    "exclude the subject, or merge its class with another."
                 )
             out[first:last] = (axes / np.sqrt(free)) @ (axes.T @ values[first:last])
         return out

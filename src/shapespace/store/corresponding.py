@@ -26,7 +26,7 @@ from shapespace.types import Mesh
 
 _OF_PROVENANCE = re.compile(r"; (\d+ of \d+ surfaces needs? review in the correspondence \([^()]*\))$")
 
-_COUNTED: Mapping[ReviewCode, str] = {
+_REASON_PHRASES: Mapping[ReviewCode, str] = {
     "doubtful": "doubtful",
     "folded": "with folded triangles",
     "not_settled": "not settled",
@@ -35,14 +35,14 @@ _COUNTED: Mapping[ReviewCode, str] = {
     "distance": "far from the scan",
     "area_change": "with large changes of area",
 }
-"""Each reason after a number of surfaces."""
+"""Description of each reason, after a number of surfaces."""
 
 
 def _percent(share: float) -> str:
     return f"{float(f'{100 * share:.2g}'):g} %"
 
 
-_DESCRIBED: Mapping[ReviewCode, Callable[[ReviewReason], str]] = {
+_DESCRIPTIONS: Mapping[ReviewCode, Callable[[ReviewReason], str]] = {
     "distance": lambda r: (
         f"1 % of its points lie farther off than {_percent(r.value)} of its size, where {_percent(r.usual)} is usual"
     ),
@@ -57,14 +57,14 @@ _DESCRIBED: Mapping[ReviewCode, Callable[[ReviewReason], str]] = {
 def describe_review(record: CorrespondRecord) -> tuple[str, ...]:
     """Return the reasons to review a surface as clauses, the doubt about its correspondence first."""
     doubt = (record.doubt,) if record.doubt else ()
-    return (*doubt, *(_DESCRIBED[reason.code](reason) for reason in record.review))
+    return (*doubt, *(_DESCRIPTIONS[reason.code](reason) for reason in record.review))
 
 
 def review_summary(review: SurfaceReview) -> str:
     """Return how many surfaces need review and why, as a clause; empty if none needs review."""
     if not review.needs_review:
         return ""
-    reasons = ", ".join(f"{count} {_COUNTED[code]}" for code, count in review.reasons.items())
+    reasons = ", ".join(f"{count} {_REASON_PHRASES[code]}" for code, count in review.reasons.items())
     verb = "needs" if review.needs_review == 1 else "need"
     return f"{review.needs_review} of {review.surfaces} surfaces {verb} review in the correspondence ({reasons})"
 
@@ -84,7 +84,7 @@ SURFACE, RECORD = CorrespondRecord.SURFACE, CorrespondRecord.ENDING
 SUMMARY, MEAN = CorrespondenceRecord.FILE, CorrespondenceRecord.MEAN
 LANDMARKS = "landmarks.csv"
 _ENDINGS = (*ENDINGS.values(), SURFACE)
-_NAMED = 3  # names in a message before the rest is only counted
+_NAMED = 3  # number of names in a message before the rest is only counted
 
 
 @dataclass(frozen=True)
@@ -92,12 +92,13 @@ class SurfaceFiles:
     """Meshes in correspondence.
 
     Args:
-        files: in the order given.
-        unit_ratios: of files in another unit than most of their folder, as of `CorrespondRecord`.
+        files: files of the meshes, in the order given.
+        unit_ratios: files in another unit than the majority of their folder -> their ratio, see `CorrespondRecord`.
         mirrored: files of surfaces that are mirror images of the majority of their folder.
         doubtful: files of surfaces that are doubtful.
-        needs_review: reasons to review surfaces, doubtful ones among them, by the records of their correspondence.
-        notes: what the user should know.
+        needs_review: surfaces that need review, doubtful ones among them -> reasons, by the records of their
+            correspondence.
+        notes: remarks for the user.
     """
 
     files: tuple[Path, ...]
@@ -127,11 +128,11 @@ class SurfaceFiles:
         return replace(mesh, vertices=mesh.vertices / ratio, position_std=std)
 
     def review(self, files: Iterable[Path], option: str = "", *, accept: bool) -> SurfaceReview:
-        """Return how many of the `files` need review by the records of their correspondence.
+        """Return the number of `files` that need review by the records of their correspondence.
 
         Args:
-            files: of the surfaces that are used, doubtful ones included.
-            option: of the command, which accepts surfaces that need review.
+            files: files of the surfaces that are used, doubtful ones included.
+            option: option of the command that accepts surfaces that need review, for messages.
             accept: whether more than half may need review.
 
         Raises:
@@ -161,7 +162,7 @@ class SurfaceFiles:
             advice = f", and use {option} to include them" if option else " and run shapespace correspond again"
             raise InputError(f"All surfaces are doubtful ({named}); inspect them{advice}.")
         included = f"; {option} includes them" if option else ""
-        note = f"{len(self.doubtful)} of {len(self.files)} surfaces are doubtful and left out ({named}){included}."
+        note = f"{len(self.doubtful)} of {len(self.files)} surfaces are doubtful and excluded ({named}){included}."
         return replace(
             self,
             files=left,
@@ -172,8 +173,8 @@ class SurfaceFiles:
         )
 
     def unit_note(self, unit: str) -> str:
-        """Return in a sentence which files are in another unit, and that they are brought to that of most."""
-        return f"{self._others()}; they are brought to that of most, which is taken for {unit}."
+        """Return a sentence on the files in another unit, which are converted to the unit of the majority."""
+        return f"{self._other_units()}; they are converted to the unit of the majority, which is assumed to be {unit}."
 
     def refuse_mixed_units(self) -> None:
         """Check that sizes can be compared.
@@ -183,11 +184,11 @@ class SurfaceFiles:
         """
         if self.unit_ratios:
             raise InputError(
-                f"{self._others()}, so that their sizes cannot be compared; bring the scans to one unit, or use "
+                f"{self._other_units()}, so that their sizes cannot be compared; bring the scans to one unit, or use "
                 "--gauge shape."
             )
 
-    def _others(self) -> str:
+    def _other_units(self) -> str:
         file_names = first_names([path.name for path in self.unit_ratios], _NAMED)
         of = "meshes is" if len(self.unit_ratios) == 1 else "meshes are"
         return f"{len(self.unit_ratios)} of {len(self.files)} {of} in another unit than most ({file_names})"
@@ -199,12 +200,12 @@ def surface_stem(path: Path) -> str:
 
 
 def surface_files(paths: Sequence[Path], *, recursive: bool = False) -> SurfaceFiles:
-    """Return `paths` with each folder replaced by the meshes in it; of a correspondence by its surfaces alone.
+    """Return `paths` with each folder replaced by its meshes; that of a correspondence only by its surfaces.
 
     Raises:
         InputError: a folder without meshes, or a correspondence that is not finished.
-        FileError: something cannot be read.
-        FileFormatError: a correspondence.json that is none.
+        FileError: a file or folder cannot be read.
+        FileFormatError: a correspondence.json that is no record of a correspondence.
     """
     files: list[Path] = []
     notes: list[str] = []
@@ -244,16 +245,16 @@ def surface_files(paths: Sequence[Path], *, recursive: bool = False) -> SurfaceF
 def reviewed_surfaces(
     paths: Sequence[Path], option: str = "", *, recursive: bool = False, with_doubtful: bool = False
 ) -> tuple[SurfaceFiles, SurfaceReview]:
-    """Return the surfaces of `surface_files` without doubtful ones, and how many of all need review.
+    """Return the surfaces of `surface_files` without doubtful ones, and the number of all that need review.
 
     Args:
         paths: files and folders.
-        option: of the command, which is given as `with_doubtful`; empty where there is none.
-        recursive: also search subfolders.
-        with_doubtful: include doubtful surfaces, and accept that more than half need review.
+        option: option of the command for `with_doubtful`, in messages; empty without a command.
+        recursive: whether to also search subfolders.
+        with_doubtful: whether to include doubtful surfaces, and to accept that more than half need review.
 
     Raises:
-        InputError: as `surface_files`; all are doubtful, or more than half need review.
+        InputError: see `surface_files`; all are doubtful, or more than half need review.
     """
     listing = surface_files(paths, recursive=recursive)
     review = listing.review(listing.files, option, accept=with_doubtful)
@@ -261,10 +262,10 @@ def reviewed_surfaces(
 
 
 def trusted_surfaces(folder: Path) -> SurfaceFiles:
-    """Return the surfaces of a folder that `build` takes, with its notes as warnings.
+    """Return the surfaces of a folder that `build` uses, with its notes as warnings.
 
     Raises:
-        InputError: as `surface_files`; all are doubtful, or more than half need review.
+        InputError: see `surface_files`; all are doubtful, or more than half need review.
     """
     listing, _ = reviewed_surfaces([folder])
     for note in listing.notes:
@@ -273,7 +274,7 @@ def trusted_surfaces(folder: Path) -> SurfaceFiles:
 
 
 def _summary_of(folder: Path) -> CorrespondenceRecord | None:
-    """Return what the correspondence in `folder` says of itself, or None where there is none."""
+    """Return the record of the correspondence in `folder`; None without a correspondence."""
     file = folder / SUMMARY
     if not file.is_file():
         if folder.is_dir() and any(folder.glob(f"*{RECORD}")):
@@ -283,11 +284,11 @@ def _summary_of(folder: Path) -> CorrespondenceRecord | None:
 
 
 def json_of(file: Path) -> object:
-    """Return what a JSON file that `correspond` wrote holds.
+    """Return the content of a JSON file that `correspond` wrote.
 
     Raises:
-        FileError: it cannot be read.
-        FileFormatError: it is not JSON.
+        FileError: the file cannot be read.
+        FileFormatError: the file is not JSON.
     """
     return read_json(file, CORRESPOND_AGAIN)
 
@@ -303,13 +304,13 @@ def _surfaces(folder: Path, summary: CorrespondenceRecord) -> list[Path]:
 
 
 def _stored_surfaces(path: Path, notes: list[str]) -> list[Path]:
-    """Return the surfaces of the fits in a folder with a store, as files for `mesh_at`; none of other folders."""
+    """Return the surfaces of the fits in a folder with a store, as files for `mesh_at`; empty for other folders."""
     results = results_at(path) if path.is_dir() else None
     if results is None:
         return []
     files = surfaces_of(results)
     if not files:
-        raise InputError(f"{path} holds no surfaces of fits; fit some scans first.")
+        raise InputError(f"{path} contains no surfaces of fits; fit some scans first.")
     if len(files) < len(results):
         notes.append(f"{path}: of {len(results)} fits the {len(files)} surfaces that end as {files[0].name} are taken.")
     notes += results.problems

@@ -19,7 +19,7 @@ from shapespace.io.files import read_bytes, read_error, sha256_of_file
 from shapespace.schemas import json_text, read
 from shapespace.version import __version__
 
-AGAIN = "copy it again from where it is whole, or take it out of the folder and fit its scans again"
+AGAIN = "copy it again from an intact store, or remove it from the folder and fit its scans again"
 TABLE, SURFACES, STAGES = "table", "surfaces", "stages"
 """Folders of a store."""
 PARTS: Mapping[str, str] = {TABLE: ".parquet", SURFACES: ".zarr.zip", STAGES: ".zip"}
@@ -27,7 +27,7 @@ PARTS: Mapping[str, str] = {TABLE: ".parquet", SURFACES: ".zarr.zip", STAGES: ".
 
 LARGEST_MANIFEST = 64 * 2**20  # 64 MiB
 MOST_ROWS = 100_000
-"""Rows that one shard may have."""
+"""Largest number of rows of a shard."""
 
 _FILE = re.compile(r"(table/[\w-]{1,80}\.parquet|surfaces/[\w-]{1,80}\.zarr\.zip|stages/[\w-]{1,80}\.zip)", re.ASCII)
 
@@ -36,11 +36,11 @@ class StoredFile(Struct, frozen=True, kw_only=True):
     """A file of a store.
 
     Args:
-        file: where it is, below the folder.
-        bytes: its size.
-        sha256: of all of it.
-        end_bytes: of a table, the size of its end, which says where everything else is; 0 for others.
-        end_sha256: and the SHA-256 of that; the rest of a table carries checksums of its own.
+        file: path of the file, relative to the folder of the store.
+        bytes: size of the file, bytes.
+        sha256: SHA-256 of the file.
+        end_bytes: size of the end of a table, bytes, which locates all other parts; 0 for other files.
+        end_sha256: SHA-256 of the end of a table; the rest of a table has checksums of its own.
     """
 
     file: str
@@ -50,10 +50,10 @@ class StoredFile(Struct, frozen=True, kw_only=True):
     end_sha256: str = ""
 
     def path(self, root: Path) -> Path:
-        """Return where it lies, once it is known to be a file of this folder of the size it should have.
+        """Return the path of the file, after a check of its name, folder and size.
 
         Raises:
-            FileFormatError: its name leads elsewhere, or it is absent, a link, or of another size.
+            FileFormatError: the name leads elsewhere, or the file is absent, a link, or of another size.
         """
         path = root / self.file
         if not _FILE.fullmatch(self.file) or path.is_symlink() or path.parent.is_symlink():
@@ -67,11 +67,11 @@ class StoredFile(Struct, frozen=True, kw_only=True):
         return path
 
     def verify_end(self, root: Path) -> Path:
-        """Return where it lies, once its end is known to be what was written; the rest is not read.
+        """Return the path of the file, after a check of the end of its content; the rest is not read.
 
         Raises:
-            FileError: it cannot be read.
-            FileFormatError: it is something else.
+            FileError: the file cannot be read.
+            FileFormatError: the content has changed.
         """
         path = self.path(root)
         try:
@@ -85,11 +85,11 @@ class StoredFile(Struct, frozen=True, kw_only=True):
         return path
 
     def verify(self, root: Path) -> Path:
-        """Return where it lies, once its content is known to be what was written.
+        """Return the path of the file, after a check of its content.
 
         Raises:
-            FileError: it cannot be read.
-            FileFormatError: it is something else.
+            FileError: the file cannot be read.
+            FileFormatError: the content has changed.
         """
         path = self.path(root)
         if sha256_of_file(path) != self.sha256:
@@ -98,16 +98,16 @@ class StoredFile(Struct, frozen=True, kw_only=True):
 
 
 class ShardEntry(Struct, frozen=True, kw_only=True):
-    """One shard: a table with a row for each fit, and surfaces of some of them.
+    """One shard: a table with a row for each fit, and surfaces of some fits.
 
     Args:
-        table: its Parquet file.
-        surfaces: its Zarr file; None where no fit has a surface.
-        stages: a zip of NAME.stages.npz; None where none were kept.
-        rows: of the table.
-        counts: fits by status.
-        first: the first name in order,
-        last: and the last.
+        table: Parquet file of the table.
+        surfaces: Zarr file of the surfaces; None if no fit has a surface.
+        stages: zip file of NAME.stages.npz; None if no stages are stored.
+        rows: number of rows of the table.
+        counts: status -> number of fits.
+        first: first name in order.
+        last: last name in order.
     """
 
     table: StoredFile
@@ -120,7 +120,7 @@ class ShardEntry(Struct, frozen=True, kw_only=True):
 
     @property
     def files(self) -> list[StoredFile]:
-        """Its files."""
+        """Files of the shard."""
         return [file for file in (self.table, self.surfaces, self.stages) if file is not None]
 
 
@@ -137,21 +137,21 @@ class Manifest(Struct, frozen=True, kw_only=True):
     shards: tuple[ShardEntry, ...] = ()
 
     def text(self) -> str:
-        """Return it as the text of its file."""
+        """Return the manifest as the text of its file."""
         return json_text(self)
 
 
 def read_manifest(folder: Path) -> Manifest | None:
-    """Return the manifest of the store in `folder`, or None where there is none.
+    """Return the manifest of the store in `folder`; None without a store.
 
     Raises:
-        FileError: it cannot be read.
-        FileFormatError: it is damaged, or of a later version.
+        FileError: the manifest cannot be read.
+        FileFormatError: the manifest is damaged, or of a later version.
     """
     path = folder / Manifest.FILE
     if not path.is_file():
         if (folder / TABLE).is_dir() and any((folder / TABLE).glob(f"[!.]*{PARTS[TABLE]}")):
-            raise FileFormatError(f"{folder} holds shards without their {Manifest.FILE}; copy that file too.")
+            raise FileFormatError(f"{folder} contains shards without their {Manifest.FILE}; copy that file too.")
         return None
     if path.stat().st_size > LARGEST_MANIFEST:
         raise FileFormatError(f"{path} is larger than a manifest can be; {AGAIN}.")
@@ -159,7 +159,7 @@ def read_manifest(folder: Path) -> Manifest | None:
         content: object = json.loads(read_bytes(path))
     except (ValueError, RecursionError) as error:
         if not (folder / TABLE).is_dir():
-            return None  # of something else
+            return None  # a manifest of another program
         raise FileFormatError(f"{path} is not JSON, or it is cut short; copy it again.") from error
     known: Mapping[str, object] = cast(dict[str, object], content) if isinstance(content, dict) else {}
     if known.get("format") != Manifest.FORMAT and not (folder / TABLE).is_dir():
@@ -173,10 +173,10 @@ def read_manifest(folder: Path) -> Manifest | None:
 
 
 def require_store_extra() -> None:
-    """Raise unless the packages that read and write stores are installed.
+    """Raise an error unless the packages that read and write stores are installed.
 
     Raises:
-        ShapespaceError: they are not; the sentence says how to install them.
+        ShapespaceError: packages are missing; the message names the command that installs them.
     """
     missing = [name for name in ("pyarrow", "zarr") if find_spec(name) is None]
     if missing:
@@ -186,7 +186,7 @@ def require_store_extra() -> None:
 
 
 def arrow(part: str = "") -> Any:
-    """Return pyarrow, or a part of it such as `.parquet`: it has no types."""
+    """Return pyarrow, or a part of it such as `.parquet`, untyped."""
     require_store_extra()
     return import_module(f"pyarrow{part}")
 

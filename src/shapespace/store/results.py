@@ -30,28 +30,28 @@ from shapespace.store.shard import ROW, Shard
 from shapespace.types import Mesh, require_path
 
 ENDING = ".fit.json"
-"""Of the record of a fit, after NAME."""
+"""Ending of the record of a fit, after NAME."""
 
 ENDINGS: Mapping[str, str] = {"fitted": ".fitted.ply", "dense": ".dense.ply", "stages": ".stages.npz"}
-"""What may lie beside it, by what it is."""
+"""Kind of a further file of a fit, next to the record -> its ending."""
 
 BATCH = 1000  # rows; a few MB with all columns
-_NEAR = 3  # similar names in a message
-_OPEN = 4  # folders
+_NEAR = 3  # number of similar names in a message
+_OPEN = 4  # number of folders that are kept open
 
 
 class StoredFit(NamedTuple):
     """Location of a fit in a store, and its files.
 
     Args:
-        shard: which one, in the order of the manifest.
-        row: of its table.
-        position: in its arrays; -1 where there is no surface.
-        id: of the fit; empty where the record has none.
-        status: of the fit.
-        fitted: whether its surface is kept,
-        dense: the dense one,
-        stages: and its stages.
+        shard: number of the shard, in the order of the manifest.
+        row: row in the table of the shard.
+        position: position in the arrays of the shard; -1 without a surface.
+        id: identity of the fit; empty if the record has none.
+        status: status of the fit.
+        fitted: whether the fitted surface is stored.
+        dense: whether the dense surface is stored.
+        stages: whether the stages are stored.
     """
 
     shard: int
@@ -72,8 +72,8 @@ class ResultStore:
     """Shards of a folder.
 
     Args:
-        folder: of the store.
-        manifest: what `read_manifest` found there.
+        folder: folder of the store.
+        manifest: manifest in the folder, from `read_manifest`.
     """
 
     def __init__(self, folder: Path, manifest: Manifest) -> None:
@@ -84,9 +84,9 @@ class ResultStore:
 
     @property
     def index(self) -> Mapping[str, StoredFit]:
-        """Name -> where it is kept, in the order of the shards; those of damaged shards are missing.
+        """Name -> location of the fit, in the order of the shards; fits of damaged shards are missing.
 
-        One sentence for each damaged shard goes to `problems`. A name that is in two shards is that of the later one.
+        One sentence for each damaged shard is added to `problems`. For a name in two shards the later shard is used.
         """
         if self._index is None:
             index: dict[str, StoredFit] = {}
@@ -112,7 +112,7 @@ class ResultStore:
         return {name: stored.id for name, stored in self.index.items()}
 
     def record_text(self, name: str) -> str:
-        """Return the record of a fit as its file had it."""
+        """Return the record of a fit as in its file."""
         stored = self.index[name]
         return self.shards[stored.shard].record_text(stored.row)
 
@@ -126,7 +126,7 @@ class ResultStore:
         return self.shards[self.index[name].shard].stages(name)
 
     def iter_rows(self, columns: Sequence[str], without: Mapping[str, object]) -> Iterator[dict[str, list[Any]]]:
-        """Yield columns of the rows of each shard, without some names; damaged shards are passed over."""
+        """Yield columns of the rows of each shard, without some names; damaged shards are skipped."""
         index = self.index
         for number, shard in enumerate(self.shards):
             try:
@@ -149,12 +149,12 @@ class ResultStore:
 class Results:
     """Results of fits in a folder, from single files and from a store.
 
-    A fit that is in both is that of the single files, which are newer. Names and flags are those of the moment when
-    this was made.
+    For a fit that is in both, the single file is used, which is newer. Names and flags are those at the time of
+    construction.
 
     Args:
-        folder: that `shapespace fit` wrote.
-        store: its shards where they are open already; None opens them.
+        folder: folder that `shapespace fit` wrote.
+        store: shards of the folder, if they are open already; None opens them.
 
     Raises:
         FileError: the folder cannot be read.
@@ -179,9 +179,9 @@ class Results:
 
     @cached_property
     def singles(self) -> Mapping[str, frozenset[str]]:
-        """Name -> which of `ENDINGS` lie beside it, of fits that are single files.
+        """Name -> kinds of `ENDINGS` next to the record, for fits in single files.
 
-        Those that a killed run had moved to a shard, and not yet removed, are none.
+        Fits that a killed run had moved to a shard, but not yet removed, are not included.
         """
         return {
             name: kinds for name, kinds in self.files.items() if name not in self._stored or not self.is_moved(name)
@@ -221,17 +221,17 @@ class Results:
         return name in self.singles or name in self._stored
 
     def has(self, name: str, kind: str) -> bool:
-        """Return whether `kind` of `ENDINGS` is kept of a fit."""
+        """Return whether a file of `kind` of `ENDINGS` is stored for a fit."""
         if name in self.singles:
             return kind in self.singles[name]
         return name in self._stored and bool(getattr(self._stored[name], kind))
 
     def record_bytes(self, name: str) -> bytes:
-        """Return the record of a fit as its file has it.
+        """Return the record of a fit as in its file.
 
         Raises:
-            FileError: it cannot be read.
-            FileFormatError: the shard that it is in is damaged.
+            FileError: the record cannot be read.
+            FileFormatError: the shard of the record is damaged.
             InputError: there is no such fit.
         """
         if name in self.singles:
@@ -239,33 +239,33 @@ class Results:
         return self._store_of(name).record_text(name).encode("utf-8", "surrogatepass")
 
     def record(self, name: str) -> dict[str, Any]:
-        """Return the content of the record of a fit, checked; `fit` returns it typed.
+        """Return the checked content of the record of a fit; `fit` returns it typed.
 
         Raises:
-            FileError: it cannot be read.
-            FileFormatError: it is damaged.
+            FileError: the record cannot be read.
+            FileFormatError: the record is damaged.
             InputError: there is no such fit.
         """
         content = self._content(name)
-        self._checked(name, content)
+        self._parse_record(name, content)
         return cast(dict[str, Any], content)
 
     def fit(self, name: str) -> FitRecord:
-        """Return the record of a fit; errors as of `record`."""
-        return self._checked(name, self._content(name))
+        """Return the record of a fit; for the errors see `record`."""
+        return self._parse_record(name, self._content(name))
 
     def _content(self, name: str) -> object:
         return parse_json(self.record_bytes(name), self.folder / f"{name}{ENDING}", FIT_AGAIN)
 
-    def _checked(self, name: str, content: object) -> FitRecord:
+    def _parse_record(self, name: str, content: object) -> FitRecord:
         return FitRecord.from_json(content, str(self.folder / f"{name}{ENDING}"))
 
     def surface(self, name: str, kind: str = "fitted") -> Mesh:
         """Return the `fitted` or `dense` surface of a fit, in the frame and unit of its scan.
 
         Raises:
-            FileError: it cannot be read.
-            FileFormatError: it is damaged, or was not kept.
+            FileError: the surface cannot be read.
+            FileFormatError: the surface is damaged, or was not stored.
             InputError: there is no such fit.
         """
         if name in self.singles:
@@ -279,8 +279,8 @@ class Results:
         """Return the content of NAME.stages.npz.
 
         Raises:
-            FileError: it cannot be read.
-            FileFormatError: it is damaged, or was not kept.
+            FileError: the stages cannot be read.
+            FileFormatError: the stages are damaged, or were not stored.
             InputError: there is no such fit.
         """
         if name in self.singles:
@@ -291,7 +291,7 @@ class Results:
         return store.stages(name)
 
     def _store_of(self, name: str) -> ResultStore:
-        """Return the store that holds a fit which is no single file, as `known` checks."""
+        """Return the store that contains a fit without a single file, after `known` has checked that it exists."""
         self.known(name)
         assert self.store is not None
         return self.store
@@ -307,20 +307,20 @@ class Results:
         return identities
 
     def counts(self) -> Counter[str]:
-        """Return how many fits have which status."""
+        """Return status -> number of fits."""
         counts: Counter[str] = Counter()
         for rows in self.iter_rows(("status",)):
             counts.update(rows["status"])
         return counts
 
     def iter_rows(self, columns: Sequence[str], batch: int = BATCH) -> Iterator[dict[str, list[Any]]]:
-        """Yield columns of all fits, some rows at a time: those of each shard in turn, then single ones by their names.
+        """Yield columns of all fits, some rows at a time: those of each shard in turn, then single files by name.
 
-        What cannot be read is left out, and one sentence about it goes to `problems`.
+        Fits that cannot be read are excluded, and one sentence about each problem is added to `problems`.
 
         Args:
-            columns: of the tables of a store, see `store.rows`; what a fit does not tell is None.
-            batch: rows at a time of single files.
+            columns: columns of the tables of a store, see `store.rows`; None for values that a fit does not state.
+            batch: number of rows of single files at a time.
         """
         if self.store is not None:
             yield from self.store.iter_rows(columns, self.singles)
@@ -336,14 +336,14 @@ class Results:
             try:
                 names |= shard.column_names()
             except ShapespaceError as error:
-                self._tell(str(error))
+                self._add_problem(str(error))
         return names.union(*([next((row.keys() for name in self.singles if (row := self._row(name))), ())]))
 
     def to_dataframe(self, columns: Sequence[str] | None = None) -> Any:
-        """Return the fits as a `pandas.DataFrame`, a row each, by their names in the order of these.
+        """Return the fits as a `pandas.DataFrame`, one row per fit, indexed and sorted by name.
 
         Args:
-            columns: some of `column_names`; None for those of coefficients.csv.
+            columns: columns among `column_names`; None for those of coefficients.csv.
 
         Raises:
             InputError: no fit has such a column.
@@ -356,7 +356,7 @@ class Results:
             columns = [head for head in coefficient_columns(modes_of(self), known) if head != CHECKSUM]
         elif unknown := [head for head in columns if head not in available]:
             raise InputError(
-                f"{self.folder}: no fit has a column {unknown[0]!r}; column_names() lists those there are."
+                f"{self.folder}: no fit has a column {unknown[0]!r}; column_names() lists the available ones."
             )
         requested = list(dict.fromkeys(["scan", *columns]))
         values: dict[str, list[Any]] = {column: [] for column in requested}
@@ -365,7 +365,7 @@ class Results:
                 values[column] += rows[column]
         frame = pandas.DataFrame(values).set_index("scan").sort_index()
         numbers = [head for head in frame.columns if kind_of(head) in ("number", "count")]
-        # Of scans that could not be fitted nothing is known, which pandas would keep as objects.
+        # Scans that could not be fitted have None in all columns, which pandas would store as objects.
         frame[numbers] = frame[numbers].astype("float64")
         return frame
 
@@ -392,10 +392,10 @@ class Results:
             message = str(error)
         except (ValueError, OverflowError):
             message = f"{self.folder / f'{name}{ENDING}'} is damaged; fit the scan again."
-        self._tell(message)
+        self._add_problem(message)
         return None
 
-    def _tell(self, problem: str) -> None:
+    def _add_problem(self, problem: str) -> None:
         if problem not in self.problems:
             self._problems.append(problem)
 
@@ -403,16 +403,16 @@ class Results:
         """Check that there is a fit of that name.
 
         Raises:
-            InputError: there is none; the sentence names those that are called nearly so.
+            InputError: there is no such fit; the message lists similar names.
         """
         if name not in self:
             suggestions = difflib.get_close_matches(name, [*self.singles, *self._stored], _NEAR, 0.6)
             hint = f"; there is {', '.join(suggestions)}" if suggestions else ""
             damage_note = "; some shards cannot be read" if self.problems else ""
-            raise InputError(f"{self.folder} holds no fit called {name[:80]}{hint}{damage_note}.")
+            raise InputError(f"{self.folder} contains no fit called {name[:80]}{hint}{damage_note}.")
 
 
-# Files of a store, by the names that they would have as single ones
+# Files of a store, by the names that they would have as single files
 
 
 def split_file_name(file: str) -> tuple[str, str]:
@@ -424,10 +424,10 @@ def split_file_name(file: str) -> tuple[str, str]:
 
 
 def results_at(folder: Path) -> Results | None:
-    """Return the results in a folder that holds a store, kept open while nothing changes; None of other folders.
+    """Return the results in a folder with a store, kept open while nothing changes; None for other folders.
 
     Raises:
-        FileError: it cannot be read.
+        FileError: the store cannot be read.
         FileFormatError: the manifest is damaged.
     """
     try:
@@ -439,7 +439,7 @@ def results_at(folder: Path) -> Results | None:
 
 @lru_cache(maxsize=_OPEN)
 def _results_at(resolved: Path, folder: Path, modified_ns: int, _files_changed: int) -> Results | None:
-    # Shards stay open where only single files came.
+    # Shards stay open if only single files were added.
     store = _store_at(resolved, folder, modified_ns)
     return None if store is None else Results(folder, store)
 
@@ -451,7 +451,7 @@ def _store_at(_resolved: Path, folder: Path, _changed: int) -> ResultStore | Non
 
 
 def _stored_at(path: Path) -> tuple[Results, str, str] | None:
-    """Return the store that contains the content of the file `path`, its name and kind there; None if none does."""
+    """Return the store with the content of the file `path`, its name and kind there; None without such a store."""
     name, kind = split_file_name(path.name)
     if not kind or path.is_file() or (results := results_at(path.parent)) is None:
         return None
@@ -468,12 +468,12 @@ def has_written_landmarks(record: Path) -> bool:
 
 
 def is_result(path: Path) -> bool:
-    """Return whether `path` is a file, or a store in its folder keeps what such a file would hold."""
+    """Return whether `path` is a file, or a store in its folder contains the content of such a file."""
     return path.is_file() or _stored_at(path) is not None
 
 
 def mesh_at(path: Path) -> Mesh:
-    """Return the mesh in a file, or the surface of a store that such a file would hold.
+    """Return the mesh in a file, or the surface of a store that replaces such a file.
 
     Raises:
         As `read_mesh`, and FileFormatError: the store is damaged.
@@ -485,7 +485,7 @@ def mesh_at(path: Path) -> Mesh:
 
 
 def _stored_bytes(path: Path) -> bytes | None:
-    """Return the record or stages of a store that a file would hold; None where there is a file, or no store."""
+    """Return the record or stages of a store that replace a file; None if there is a file, or no store."""
     stored = _stored_at(path)
     if stored is None:
         return None
@@ -494,16 +494,16 @@ def _stored_bytes(path: Path) -> bytes | None:
 
 
 def json_at(path: Path, remedy: str, most_bytes: int = LARGEST_BYTES) -> Any:
-    """Return the value in a JSON file, or in the record of a store that such a file would hold.
+    """Return the value in a JSON file, or in the record of a store that replaces such a file.
 
     Args:
-        path: of the file.
-        remedy: what a reader can do about a file that is wrong.
-        most_bytes: that such a file can have.
+        path: path of the file.
+        remedy: advice for a file that is wrong, in messages.
+        most_bytes: largest allowed size of the file, bytes.
 
     Raises:
-        FileError: it cannot be read.
-        FileFormatError: it is too large, or not plain JSON.
+        FileError: the file cannot be read.
+        FileFormatError: the file is too large, or not plain JSON.
     """
     content = _stored_bytes(path)
     if content is None:
@@ -514,11 +514,11 @@ def json_at(path: Path, remedy: str, most_bytes: int = LARGEST_BYTES) -> Any:
 
 
 def arrays_at(path: Path, remedy: str) -> dict[str, npt.NDArray[Any]]:
-    """Return the arrays of an .npz file, or of stages of a store that such a file would hold, by name.
+    """Return the arrays of an .npz file, or of stages of a store that replace such a file, by name.
 
     Raises:
-        FileError: it cannot be read.
-        FileFormatError: it is damaged, or holds other things than arrays.
+        FileError: the file cannot be read.
+        FileFormatError: the file is damaged, or contains other data than arrays.
     """
     content = _stored_bytes(path)
     if content is None:
@@ -530,7 +530,7 @@ def arrays_at(path: Path, remedy: str) -> dict[str, npt.NDArray[Any]]:
 
 
 def surfaces_of(results: Results) -> list[Path]:
-    """Return the files that the surfaces of a store would be: the dense ones where there are any, else the fitted."""
+    """Return the files that the surfaces of a store replace: the dense ones if there are any, else the fitted ones."""
     for kind in ("dense", "fitted"):
         if paths := [results.folder / f"{name}{ENDINGS[kind]}" for name in results.names() if results.has(name, kind)]:
             return paths

@@ -27,23 +27,23 @@ _LAST_COLUMNS = (
     *(f"rotation_{axis}_deg" for axis in _AXES),
     *(f"translation_{axis}" for axis in _AXES),
 )
-"""Columns that stand before the last, `model_hash`, so that those that were there earlier keep their order."""
+"""Columns before the last, `model_hash`, so that those of earlier versions keep their order."""
 
 RECORD = "record"
-"""The column of a store that holds the whole record as its file had it."""
+"""Column of a store with the complete record as in its file."""
 
 META = "meta_"
-"""What columns begin with that were in the list of the scans."""
+"""Prefix of the columns that were in the list of the scans."""
 
 _EVIDENCE = "evidence_"
 FLAGS = ("fitted", "dense", "stages")
-"""Columns of a store that say which surfaces are kept."""
+"""Columns of a store that state which files of a fit are stored."""
 
 TEXTS = (
     "scan", "id", "status", "reason", "start", "path", "scan_name", "scan_hash", "scan_version", "model_name",
     "model_hash", "method", "version", RECORD,
 )  # fmt: skip
-"""Columns of text; those whose names begin with `META` are too."""
+"""Columns of text, in addition to those whose names begin with `META`."""
 
 COUNTS = (
     *(f"{direction}_count" for direction in _DIRECTIONS),
@@ -52,7 +52,7 @@ COUNTS = (
     "scan_size_bytes",
     "scan_modified_ns",
 )
-"""Columns of whole numbers."""
+"""Columns of integers."""
 
 
 def coefficient_row(name: str, record: FitRecord) -> dict[str, Any]:
@@ -92,7 +92,7 @@ def _size_cells(record: FitRecord) -> dict[str, Any]:
 
 
 def _moved_cells(record: FitRecord) -> dict[str, float]:
-    """Return the RMS, mm of the scan, by which each mode, and all together, move a vertex; b is a norm over all."""
+    """Return the RMS displacement of a vertex by each mode and by all modes, mm of the scan; b is a norm over all."""
     if not record.n_vertices or record.T_scan_model is None or record.mm_per_scan_unit is None:
         return {}
     scan_mm_per_model_mm = record.T_scan_model.scale * record.mm_per_scan_unit
@@ -169,7 +169,7 @@ def store_row(name: str, record: FitRecord) -> dict[str, Any]:
 
 
 def kind_of(column: str) -> str:
-    """Return what a column of a store holds: `text`, `count`, `flag` or `number`."""
+    """Return the kind of values of a column of a store: `text`, `count`, `flag` or `number`."""
     if column in TEXTS or column.startswith(META):
         return "text"
     return "count" if column in COUNTS else "flag" if column in FLAGS else "number"

@@ -22,16 +22,16 @@ if TYPE_CHECKING:
     from collections.abc import Generator
 
 KINDS = ("fitted", "dense")
-"""Surfaces of a fit that a store keeps."""
+"""Kinds of surfaces of a fit in a store."""
 
 ROW = "row"
-"""The column that says where in the arrays of its shard a fit stands."""
+"""Column of the position of a fit in the arrays of its shard."""
 
 MOST_EXPANSION, LEAST_BYTES = 200, 16 * 2**20
-"""A table may hold this many times its bytes on disk, and this many bytes in any case."""
+"""A table may have this many times its bytes on disk, and this many bytes in any case."""
 
-_OPEN = 16  # files
-_RECORDS_KEPT = 2  # row groups; records are read one after the other
+_OPEN = 16  # number of files that are kept open
+_RECORDS_KEPT = 2  # number of row groups; records are read in order
 
 
 class Shard:
@@ -39,7 +39,7 @@ class Shard:
 
     Args:
         root: folder of the store.
-        entry: of its manifest.
+        entry: entry of the shard in the manifest.
 
     Raises:
         ShapespaceError: the extra `store` is not installed.
@@ -54,15 +54,15 @@ class Shard:
 
     @property
     def name(self) -> str:
-        """What it is called in messages."""
+        """Name of the shard in messages."""
         return str(self.root / self.entry.table.file)
 
     def columns(self, names: Sequence[str]) -> dict[str, list[Any]]:
-        """Return columns of the table, one value a row; None where a fit, or the whole shard, does not tell.
+        """Return columns of the table, one value per row; None for values that a fit, or all fits, do not state.
 
         Raises:
-            FileError: it cannot be read.
-            FileFormatError: it is damaged, or not what the manifest says.
+            FileError: the table cannot be read.
+            FileFormatError: the table is damaged, or does not match the manifest.
         """
         with self._table() as table:
             stored = [column for column in names if column in self._names_of_columns]
@@ -83,11 +83,11 @@ class Shard:
             return self._names_of_columns
 
     def record_text(self, row: int) -> str:
-        """Return the record of a row as its file had it.
+        """Return the record of a row as in its file.
 
         Raises:
-            FileError: it cannot be read.
-            FileFormatError: it is damaged.
+            FileError: the record cannot be read.
+            FileFormatError: the record is damaged.
         """
         with self._table():
             group_ends = np.cumsum(self._row_groups)
@@ -101,13 +101,13 @@ class Shard:
         """Return a surface in the frame and unit of its scan.
 
         Args:
-            row: its value in the column `ROW`.
-            kind: of `KINDS`.
-            name: for the mesh.
+            row: position of the fit, its value in the column `ROW`.
+            kind: kind of surface, one of `KINDS`.
+            name: name of the mesh.
 
         Raises:
-            FileError: it cannot be read.
-            FileFormatError: it is not there, or damaged.
+            FileError: the surface cannot be read.
+            FileFormatError: the surface is missing or damaged.
         """
         if self.entry.surfaces is None:
             raise FileFormatError(f"{self.name} has no surfaces; {AGAIN}.")
@@ -119,8 +119,8 @@ class Shard:
         """Return the content of NAME.stages.npz.
 
         Raises:
-            FileError: it cannot be read.
-            FileFormatError: it is not there, or damaged.
+            FileError: the stages cannot be read.
+            FileFormatError: the stages are missing or damaged.
         """
         if self.entry.stages is None:
             raise FileFormatError(f"{self.name} has no stages; {AGAIN}.")
@@ -138,7 +138,7 @@ class Shard:
             yield table
 
     def _check(self, metadata: Any, schema: Any, path: Path) -> None:
-        """Refuse a table that is not one of ours, or whose columns would grow far beyond the bytes of its file."""
+        """Check that the table is one of a store, and that its columns are not much larger than its file."""
         groups = [metadata.row_group(k) for k in range(metadata.num_row_groups)]
         total_bytes = sum(group.total_byte_size for group in groups)
         kinds = {"text": "string", "number": "double", "count": "int64", "flag": "bool"}
@@ -164,12 +164,12 @@ class Shard:
 
 @lru_cache(maxsize=_RECORDS_KEPT)
 def _records(shard: Shard, group: int) -> list[Any]:
-    # Of all shards together, since each group holds some MB.
+    # Cached for all shards together, since each group has some MB.
     return shard.records(group)
 
 
 def is_plain_name(name: object) -> bool:
-    """Return whether `name` may be a part of a file's name and leads nowhere else."""
+    """Return whether `name` may be a part of a file's name and does not lead to another folder."""
     return (
         isinstance(name, str)
         and bool(name)
@@ -183,20 +183,20 @@ def _check_values(column: str, values: Sequence[object], path_name: str) -> None
     if column == "scan" and not (all(map(is_plain_name, values)) and len(set(values)) == len(values)):
         raise FileFormatError(f"{path_name} has names that no results can have; {AGAIN}.")
     if column == ROW and any(not isinstance(value, int) or value < -1 for value in values):
-        raise FileFormatError(f"{path_name} does not say where its surfaces are; {AGAIN}.")
+        raise FileFormatError(f"{path_name} does not state where its surfaces are; {AGAIN}.")
     if column == "status" and not all(isinstance(value, str) for value in values):
         raise FileFormatError(f"{path_name} has rows without a status; {AGAIN}.")
 
 
 @contextmanager
 def _damage(path: Path) -> Generator[None]:
-    """Turn what libraries raise for a file that is not what it seems into one sentence."""
+    """Replace the exceptions of libraries for damaged files by a shapespace error with one sentence."""
     try:
         yield
     except ShapespaceError:
         raise
     except OSError as error:
-        # pyarrow raises plain ones without a number for files that it cannot decode.
+        # pyarrow raises plain OSErrors without a number for files that it cannot decode.
         if error.errno is not None:
             raise FileError(f"Cannot read {path}: {error.strerror or error}.") from error
         raise FileFormatError(f"{path} is damaged; {AGAIN}.") from error
@@ -207,7 +207,7 @@ def _damage(path: Path) -> Generator[None]:
 
 
 def _check_members(archive: zipfile.ZipFile, path: Path) -> None:
-    """Refuse what is compressed or counted twice: so no member is larger than the bytes of the file."""
+    """Check that no member is compressed or listed twice, so that none is larger than the bytes of the file."""
     members = archive.infolist()
     if (
         any(member.compress_type != zipfile.ZIP_STORED for member in members)
@@ -219,7 +219,7 @@ def _check_members(archive: zipfile.ZipFile, path: Path) -> None:
 
 
 def array_metadata(shape: Sequence[int], chunk: Sequence[int], kind: str) -> dict[str, Any]:
-    """Return what the zarr.json of an array of a store says; nothing else is read."""
+    """Return the expected content of the zarr.json of an array of a store; nothing else is read."""
     return {
         "shape": list(shape),
         "data_type": kind,
@@ -261,10 +261,10 @@ class _Surfaces:
                 self._faces = self._chunk("faces", 0)
 
     def read(self, kind: str, row: int) -> tuple[FloatArray, npt.NDArray[np.int32] | None, ByteArray | None]:
-        """Return vertices (V, 3) of row `row`, the faces, and the colours (V, 3) where there are some."""
+        """Return vertices (V, 3) of row `row`, the faces, and the colours (V, 3) if there are some."""
         with _damage(self._path):
             offsets, origin = self._chunk(kind, row)[0], self._chunk(f"{kind}_origin", 0)[row]
-            # Only what has colours has a chunk there.
+            # Only fits with colours have a chunk there.
             colour_kind = f"{kind}_colours"
             colours = self._chunk(colour_kind, row)[0] if f"{colour_kind}/c/{row}/0/0" in self._sizes else None
             return offsets.astype(np.float64) + origin, self._faces, colours
@@ -283,7 +283,7 @@ class _Surfaces:
         expected = array_metadata(shape, chunk, kind)
         values = {key: metadata.get(key) for key in expected}
         if kind == "uint8" and values["codecs"] == [{"name": "bytes"}]:
-            values["codecs"] = expected["codecs"]  # bytes have no order, which zarr says since 3.1
+            values["codecs"] = expected["codecs"]  # bytes have no order, which zarr omits since 3.1
         if (
             values != expected
             or kind not in _ITEM
@@ -293,5 +293,5 @@ class _Surfaces:
             or not all(type(n) is int and 0 < n < 2**31 for n in (*shape, *chunk))
             or shape[-1] != 3 or chunk[1:] != shape[1:]
         ):  # fmt: skip
-            raise FileFormatError(f"{self._path} holds arrays that no store has; {AGAIN}.")
+            raise FileFormatError(f"{self._path} contains arrays that no store has; {AGAIN}.")
         return cast("tuple[tuple[int, ...], tuple[int, ...], int]", (shape, chunk, _ITEM[kind]))

@@ -1,1 +1,1 @@
-"""Who is it: scores between scans of people, and how well they tell one person from another."""
+"""Recognition of people from scans: similarity scores, and their error rates in verification and identification."""

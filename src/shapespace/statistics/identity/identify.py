@@ -29,9 +29,8 @@ class Searches:
 
     Args:
         person: (S,) number of the person of each probe.
-        rank: (S,) place of that person among all enrolled, 1 for the first, ties counted against it; 0 where they are
-            not enrolled.
-        own: (S,) score of that person; minus infinity where they are not enrolled.
+        rank: (S,) rank of that person among all enrolled, 1 for the first, ties counted against it; 0 if not enrolled.
+        own: (S,) score of that person; minus infinity if not enrolled.
         best_other: (S,) highest score of another person.
     """
 
@@ -49,7 +48,7 @@ class Searches:
 
     @property
     def enrolled(self) -> BoolArray:
-        """(S,) whose person is in the gallery."""
+        """(S,) whether the person of each probe is in the gallery."""
         return self.rank > 0
 
     def cmc(self, most: int, weights: FloatArray | None = None) -> FloatArray:
@@ -59,17 +58,17 @@ class Searches:
         return np.cumsum(np.bincount(rank, weights=w, minlength=most + 1))[:most] / w.sum()
 
     def fnir(self, fpir: FloatArray, weights: FloatArray | None = None) -> FloatArray:
-        """Return the share of enrolled probes missed at thresholds that let at most `fpir` of others in.
+        """Return the share of enrolled probes missed at thresholds that accept at most `fpir` of the impostor searches.
 
-        Those others are probes of people who are not enrolled or, where there are none, all probes searched for without
-        their own person. A miss is a person who is below the threshold or not the first.
+        Impostor searches are probes of people who are not enrolled or, if all are enrolled, all probes searched for
+        without their own person. A miss is a person who is below the threshold or not the first.
         """
         w = np.ones(len(self.rank)) if weights is None else weights
         strangers = ~self.enrolled if not self.enrolled.all() else self.enrolled
         score, own = self.best_other[strangers], w[strangers]
         order = np.argsort(-score, kind="stable")
         ranked, let_in = score[order], np.cumsum(own[order]) / own.sum()
-        # The lowest score that may be let in at each threshold, ties let in together.
+        # The lowest score that may be accepted at each threshold, ties accepted together.
         ends = np.flatnonzero(np.append(ranked[1:] != ranked[:-1], True))
         count = np.searchsorted(let_in[ends], np.asarray(fpir) * (1 + _JUST), side="right")
         first_refused = np.append(ranked[ends], -np.inf)[count]
@@ -87,7 +86,7 @@ class IdentificationRates:
         rank_1: share of enrolled probes whose person is first.
         cmc: (R,) share found within the first 1 to R people.
         band: (2, R) ends of its interval.
-        fnir: FPIR -> share missed; without a value where there are too few searches to say.
+        fnir: FPIR -> share missed; no value if there are too few searches.
     """
 
     name: str
@@ -126,10 +125,10 @@ class IdentificationResult(AnalysisResult):
     config: IdentityConfig
 
     def __getitem__(self, name: str) -> IdentificationRates:
-        return next(one for one in self.scores if one.name == name)
+        return next(rates for rates in self.scores if rates.name == name)
 
     def __repr__(self) -> str:
-        ranks = list_briefly([f"{one.name}: rank 1 {one.rank_1.briefly()}" for one in self.scores])
+        ranks = list_briefly([f"{rates.name}: rank 1 {rates.rank_1.briefly()}" for rates in self.scores])
         return f"<IdentificationResult of {self.probes} probes among {self.enrolled} subjects; {ranks}>"
 
 
@@ -137,7 +136,7 @@ def search(scores: FloatArray, gallery: IntArray, probes: IntArray) -> Searches:
     """Search the gallery for each probe; the score of a person is that of the most similar scan.
 
     Args:
-        scores: (G, P).
+        scores: (G, P) scores.
         gallery: (G,) number of the person of each scan.
         probes: (P,) number of the person of each probe.
 
@@ -166,10 +165,10 @@ def identify(
         cohort: scans with a column that identifies the person.
         config: roles of the scans; None enrols the first scan of each person. With folds, people are searched for among
             those of their own fold.
-        progress: called with (done, total).
+        progress: function called with (done, total).
 
     Raises:
-        InputError: as `trial_of`, or too few people to learn from.
+        InputError: invalid roles, see `trial_of`, or too few training people.
         ShapespaceError: scikit-learn is not installed.
 
     Example:
@@ -196,15 +195,15 @@ def identify(
     return IdentificationResult(
         scores=tuple(rates),
         enrolled=min(sizes),
-        probes=sum(len(one.probes) for one in trial.rounds),
-        trained_on=min(len({trial.subjects[row] for row in one.training}) for one in trial.rounds),
+        probes=sum(len(round_.probes) for round_ in trial.rounds),
+        trained_on=min(len({trial.subjects[row] for row in round_.training}) for round_ in trial.rounds),
         trial=trial,
         config=config,
     )
 
 
 def joined(parts: Sequence[Searches]) -> Searches:
-    """Return the searches of several rounds as one."""
+    """Return the searches of several rounds together."""
     fields = ("person", "rank", "own", "best_other")
     return Searches(*(np.concatenate([getattr(part, field) for part in parts]) for field in fields))
 
@@ -216,7 +215,7 @@ def identification_rates(name: str, searches: Searches, n_ranks: int, people: Fl
         name: name of the score.
         searches: results of all probes.
         n_ranks: number of ranks of the CMC curve.
-        people: (draws, P) from `people_drawn`.
+        people: (draws, P) bootstrap samples from `people_drawn`.
     """
     rates = np.array(FPIR)
     rows: list[FloatArray] = []

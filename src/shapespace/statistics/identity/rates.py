@@ -22,9 +22,9 @@ class Pairs:
     """Pairs of scans.
 
     Args:
-        one: (M,) number of the person of the first.
-        other: (M,) and of the second.
-        rows: (M, 2) of the cohort.
+        one: (M,) number of the person of the first scan.
+        other: (M,) number of the person of the second scan.
+        rows: (M, 2) rows of the two scans in the cohort.
     """
 
     one: IntArray
@@ -38,7 +38,7 @@ class Pairs:
 
     @cached_property
     def same(self) -> BoolArray:
-        """(M,) whether both are of one person."""
+        """(M,) whether both scans are of one person."""
         return self.one == self.other
 
     @property
@@ -47,20 +47,20 @@ class Pairs:
         return len(np.unique(self.one[self.same]))
 
     def take(self, chosen: BoolArray) -> Pairs:
-        """Return the chosen ones, (M,)."""
+        """Return the chosen pairs, (M,)."""
         return Pairs(self.one[chosen], self.other[chosen], self.rows[chosen])
 
     def weights(self, times: FloatArray) -> FloatArray:
-        """Return (M,) how often each pair is there if person k is there `times[k]` times."""
+        """Return (M,) the multiplicity of each pair if person k occurs `times[k]` times."""
         return np.where(self.same, times[self.one], times[self.one] * times[self.other])
 
 
 @dataclass(frozen=True, eq=False)
 class Roc:
-    """Rates against the threshold: a pair is accepted if its score is at least that.
+    """Error rates by threshold: a pair is accepted if its score is at least the threshold.
 
     Args:
-        threshold: (T,) falling, the first of them infinite.
+        threshold: (T,) thresholds, descending, the first of them infinite.
         far: (T,) share of impostor pairs accepted, from 0 to 1.
         tar: (T,) share of genuine pairs accepted, from 0 to 1.
     """
@@ -73,7 +73,7 @@ class Roc:
 
     @property
     def eer(self) -> float:
-        """Where as many genuine pairs are refused as impostors accepted, between the two nearest thresholds."""
+        """Equal error rate, at which FAR and 1 - TAR are equal, interpolated between the two nearest thresholds."""
         gap = 1.0 - self.tar - self.far
         after = int(np.argmax(gap <= 0))
         before = after - 1
@@ -89,11 +89,11 @@ class Sweep:
     """All thresholds of some scores, sorted once for any weights.
 
     Args:
-        score: (M,).
-        same: (M,) genuine pairs.
+        score: (M,) scores.
+        same: (M,) whether each pair is genuine.
 
     Raises:
-        InputError: scores that are not finite, or no pair of one of both kinds.
+        InputError: scores that are not finite, or no pair of one of the two kinds.
     """
 
     def __init__(self, score: FloatArray, same: BoolArray) -> None:
@@ -111,7 +111,7 @@ class Sweep:
         self._same = same[self._order]
 
     def roc(self, weights: FloatArray | None = None) -> Roc:
-        """Return the rates with each pair counted as often as `weights` (M,) says; None for once."""
+        """Return the rates with each pair counted `weights` (M,) times; None for once."""
         w = np.ones(len(self._order)) if weights is None else weights[self._order]
         genuine = np.cumsum(np.where(self._same, w, 0.0))
         impostor = np.cumsum(np.where(self._same, 0.0, w))
@@ -121,7 +121,7 @@ class Sweep:
 
 @dataclass(frozen=True)
 class RateEstimate:
-    """A figure with its 95 % interval over people; None if the data are too few.
+    """A rate with its 95 % interval over people; None if the data are too few.
 
     The interval of a share is never narrower than the exact one without an error, see `widen_share`.
     """
@@ -131,7 +131,7 @@ class RateEstimate:
     high: float | None = None
 
     def briefly(self) -> str:
-        """Return the figure in percent with its interval, for a one-line repr."""
+        """Return the rate in percent with its interval, for a one-line repr."""
         if self.value is None:
             return "unknown"
         interval = "" if self.low is None or self.high is None else f" ({100 * self.low:.3g} to {100 * self.high:.3g})"
@@ -139,7 +139,7 @@ class RateEstimate:
 
 
 def people_drawn(tested: BoolArray, draws: int, seed: int) -> FloatArray:
-    """Return (draws, P) how often each person is there in draws with replacement of those who are `tested` (P,)."""
+    """Return (draws, P) how often each person occurs in draws with replacement of the `tested` (P,) people."""
     rng = np.random.default_rng((seed, 14))
     count = int(tested.sum())
     out = np.zeros((draws, len(tested)))
@@ -148,14 +148,14 @@ def people_drawn(tested: BoolArray, draws: int, seed: int) -> FloatArray:
 
 
 def rate_estimate(value: float | None, drawn: Sequence[float] | FloatArray, people: int | None = None) -> RateEstimate:
-    """Return a figure with its bootstrap interval over people.
+    """Return a rate with its bootstrap interval over people.
 
     Args:
-        value: of all people.
-        drawn: the figure of each draw of people; NaN where a draw has none.
-        people: number of people in a share of errors, for its ends near 0 and 1; None for other figures.
+        value: rate of all people.
+        drawn: rate of each draw of people; NaN if a draw has none.
+        people: number of people in a share of errors, for its ends near 0 and 1; None for other quantities.
     """
-    known = np.asarray([one for one in drawn if np.isfinite(one)])
+    known = np.asarray([rate for rate in drawn if np.isfinite(rate)])
     if value is None or not (len(known) or (people and value in (0.0, 1.0))):
         return RateEstimate(value)
     tail = 50.0 * (1.0 - _LEVEL)
@@ -172,14 +172,14 @@ def resampled(
     figures: int,
     on_draw: Callable[[], None] | None = None,
 ) -> FloatArray:
-    """Return the (draws, figures) that `of` makes of the weights of pairs; NaN where a draw loses a kind of pair.
+    """Return the (draws, figures) values of the function `of` for weights of pairs; NaN if a draw loses a kind of pair.
 
     Args:
-        pairs: of whom.
-        people: (draws, P) from `people_drawn`.
-        of: (M,) weights -> (figures,).
-        figures: how many.
-        on_draw: called after each draw.
+        pairs: compared pairs.
+        people: (draws, P) bootstrap samples from `people_drawn`.
+        of: function from weights (M,) to values (figures,).
+        figures: number of values.
+        on_draw: function called after each draw.
     """
     out = np.full((len(people), figures), np.nan)
     for row, times in zip(out, people, strict=True):

@@ -1,4 +1,4 @@
-"""Scores: how alike two scans are, larger for more alike. Each is learned from people who are not tested."""
+"""Similarity scores of two scans, larger for more similar scans; each score is trained on people who are not tested."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ class Samples:
 
     Args:
         x: (N, K) whitened coefficients of identity, in standard deviations.
-        variance: (N, K) of the error that each fit states of them; 0 where nothing is stated.
-        mm: (N, D) coefficients of the whole shapes in an orthonormal basis, mm.
-        subjects: (N,) whom each shows.
-        n_vertices: over which distances in mm are averaged.
+        variance: (N, K) variance of their error that each fit states; 0 if none is stated.
+        mm: (N, D) coefficients of the complete shapes in an orthonormal basis, mm.
+        subjects: (N,) person that each scan shows.
+        n_vertices: number of vertices over which distances in mm are averaged.
 
     Raises:
         InputError: arrays that do not belong together, or that are not finite.
@@ -55,7 +55,7 @@ class Samples:
         return len(self.subjects)
 
     def take(self, rows: Sequence[int]) -> Samples:
-        """Return some of them, in their order."""
+        """Return some of the scans, in the order of `rows`."""
         indices = np.asarray(rows, dtype=np.intp)
         return replace(
             self,
@@ -66,38 +66,39 @@ class Samples:
         )
 
     def leading(self, modes: int | None) -> Samples:
-        """Return them with the first `modes` coefficients; None for all.
+        """Return the scans with the first `modes` coefficients; None for all.
 
         Raises:
-            InputError: there are not so many.
+            InputError: there are fewer coefficients.
         """
         if modes is None or modes == self.x.shape[1]:
             return self
         if not 1 <= modes <= self.x.shape[1]:
-            raise InputError(f"There are {self.x.shape[1]} coefficients of identity, so {modes} cannot be had.")
+            raise InputError(f"The number of modes must be 1 to {self.x.shape[1]}, that of coefficients, not {modes}.")
         return replace(self, x=self.x[:, :modes], variance=self.variance[:, :modes])
 
 
 def samples_of(
     cohort: Cohort, subjects: Sequence[str], training: Sequence[int], *, uncertainty: bool = True
 ) -> Samples:
-    """Return the identity in each shape of a cohort.
+    """Return the coefficients of identity of each shape of a cohort.
 
-    Of fits by a model that parts identity and expression it is the identity; of other fits all coefficients, in the
-    model's standard deviations. Surfaces without fits are whitened by the principal components of `training`.
+    For fits by a model that separates identity and expression these are the coefficients of identity, for other fits
+    all coefficients, in the model's standard deviations. Surfaces without fits are whitened by the principal components
+    of `training`.
 
     Args:
-        cohort: N shapes.
-        subjects: (N,) whom each shows.
+        cohort: cohort of N shapes.
+        subjects: (N,) person that each shape shows.
         training: rows of people who are not tested.
-        uncertainty: False takes all fits for exact.
+        uncertainty: whether the stated errors of fits are used; False assumes exact fits.
 
     Raises:
-        InputError: surfaces without fits, and fewer than three of them to learn from.
+        InputError: surfaces without fits, and fewer than three training surfaces.
     """
     mm, vertices = cohort.coefficients, cohort.n_vertices
     if cohort.fitted is not None:
-        x, variance = _of_fits(cohort.fitted)
+        x, variance = _identity_of_fits(cohort.fitted)
         return Samples(x, variance if uncertainty else np.zeros_like(x), mm, tuple(subjects), vertices)
     if len(training) < 3:
         raise InputError(
@@ -113,19 +114,19 @@ def samples_of(
     return Samples(read_only(x), np.zeros_like(x), mm, tuple(subjects), vertices)
 
 
-def _of_fits(fitted: Fitted) -> tuple[FloatArray, FloatArray]:
+def _identity_of_fits(fitted: Fitted) -> tuple[FloatArray, FloatArray]:
     """Return the coefficients of identity (N, K) and the variances of their errors."""
     stddev = fitted.model.stddev[: fitted.b.shape[1]]
     z, variance = fitted.z, (fitted.b_stddev / stddev) ** 2
     if fitted.additive is None:
         return z, variance
-    # Only the diagonal is kept in files, so errors of different modes are taken as independent.
+    # Files contain only the diagonal, so errors of different modes are assumed to be independent.
     turn = fitted.additive.rotation[: fitted.additive.n_identity, : z.shape[1]]
     return z @ turn.T, variance @ (turn**2).T
 
 
 Scorer: TypeAlias = Callable[[Samples, Samples], FloatArray]
-"""(gallery, probes) -> (G, P) scores, alike if the two change places."""
+"""(gallery, probes) -> (G, P) scores; exchanging the two transposes the scores."""
 
 
 def _directions(x: FloatArray) -> FloatArray:
@@ -146,15 +147,15 @@ coefficients of identity, and by the plain distance of the shapes, RMS over vert
 ratio."""
 
 
-def refuse_unknown_scores(names: Sequence[str]) -> None:
+def check_score_names(names: Sequence[str]) -> None:
     """Check that `names` are scores.
 
     Raises:
-        InputError: there are none, or one is not known.
+        InputError: the list is empty, or a score is not known.
     """
     unknown = [name for name in names if name not in SCORES]
     if unknown or not names:
-        raise InputError(f"Scores are {', '.join(SCORES)}, not {', '.join(unknown) or 'none at all'}.")
+        raise InputError(f"Scores are {', '.join(SCORES)}, not {', '.join(unknown) or 'an empty list'}.")
 
 
 # PLDA: a score of two scans being of one person, by normal within- and between-person covariance
@@ -173,13 +174,13 @@ class TwoCovariance:
     single samples: Cumani, Plchot and Laface, IEEE/ACM TASLP 22(4), 2014.
 
     Args:
-        mean: (K,) of all people.
+        mean: (K,) mean of all people.
         basis: (K, K) columns v with v^T W v = 1, so that basis^T B basis is diagonal.
-        between: (K,) that diagonal.
-        noise: (K,) share of the covariance within that is taken for errors of fits.
-        noise_scale: (K,) of the variances that fits state, so that those of training make up `noise` on average.
-        people: learned from.
-        scans: learned from.
+        between: (K,) this diagonal.
+        noise: (K,) share of the covariance within that is attributed to errors of fits.
+        noise_scale: (K,) factor of the variances that fits state, so that those of training make up `noise` on average.
+        people: number of training people.
+        scans: number of training scans.
     """
 
     mean: FloatArray
@@ -192,14 +193,14 @@ class TwoCovariance:
 
     @staticmethod
     def learn(training: Samples) -> TwoCovariance:
-        """Return the covariances of `training`, shrunk as far as Ledoit and Wolf find it needs (2004).
+        """Return the covariances of `training`, shrunk by the amount of Ledoit and Wolf (2004).
 
-        The errors that fits state are part of the covariance within. Where they exceed nine tenths of it they are
-        scaled down to that: files keep their diagonal alone, which overstates the error in those directions in which
-        errors of several coefficients cancel.
+        The errors that fits state are part of the covariance within. If they exceed nine tenths, they are scaled down
+        to that share: files contain only their diagonal, which overstates the error in directions in which errors of
+        several coefficients cancel.
 
         Raises:
-            InputError: fewer than three people, or nobody of them has two scans.
+            InputError: fewer than three people, or no person with two scans.
             ShapespaceError: scikit-learn is not installed.
         """
         shrunk = require_package("sklearn.covariance", "The PLDA score", "'shapespace[statistics]'").ledoit_wolf
@@ -209,7 +210,7 @@ class TwoCovariance:
             raise InputError(
                 f"The PLDA score is trained on subjects who are not tested, and there are {len(names)}, of whom "
                 f"{int((counts > 1).sum())} have two scans; give three subjects or more and several scans of each, or "
-                "leave it out of --scores."
+                "remove it from --scores."
             )
         n, k = training.x.shape
         means = np.zeros((len(names), k))
@@ -221,7 +222,7 @@ class TwoCovariance:
         freedom = several.sum() - (counts > 1).sum()
         within = cast(FloatArray, shrunk(own[several], assume_centered=True)[0]) * (several.sum() / freedom)
         spread = cast(FloatArray, shrunk(means - mean, assume_centered=True)[0]) * (len(names) / (len(names) - 1))
-        between = _less(spread, within * float((1.0 / counts).mean()), _LEAST_BETWEEN)  # S61
+        between = _subtract_covariance(spread, within * float((1.0 / counts).mean()), _LEAST_BETWEEN)  # S61
         values, basis = cast(tuple[FloatArray, FloatArray], eigh(between, within))
         stated = training.variance.mean(axis=0) @ basis**2
         noise = np.minimum(stated, _MOST_NOISE)
@@ -233,7 +234,7 @@ class TwoCovariance:
         """Return (G, P) scores: natural log likelihood, by the model, of one person minus that of two.
 
         They are likelihood ratios only if the normal model and its covariances are right, which a small training set
-        does not ensure; `calibrated` makes likelihood ratios of them.
+        does not ensure; `calibrated` converts them to likelihood ratios.
 
         The covariance within of each scan has its own errors in the place of those of the training; their diagonal in
         the coordinates of `basis` is used.
@@ -241,7 +242,7 @@ class TwoCovariance:
         g, p = (samples.x - self.mean for samples in (gallery, probes))
         g, p = g @ self.basis, p @ self.basis
         # Total variances, (G, K) and (P, K).
-        of_g, of_p = (self.between + self.within(one) for one in (gallery, probes))
+        of_g, of_p = (self.between + self.within(samples) for samples in (gallery, probes))
         alone = (p**2 / of_p + np.log(of_p)).sum(axis=1)
         out = np.empty((len(g), len(p)))
         for row, (x, total) in enumerate(zip(g, of_g, strict=True)):
@@ -253,12 +254,12 @@ class TwoCovariance:
         return out
 
     def within(self, samples: Samples) -> FloatArray:
-        """Return (N, K) variances within a person, of which 1 is usual, in the coordinates of `basis`."""
+        """Return (N, K) variances within a person, 1 on average over training scans, in the coordinates of `basis`."""
         return 1.0 - self.noise + self.noise_scale * (samples.variance @ self.basis**2)
 
 
-def _less(total: FloatArray, part: FloatArray, least: float) -> FloatArray:
-    """Return `whole` less `part`, of which in no direction less than the share `least` of `whole` is left."""
+def _subtract_covariance(total: FloatArray, part: FloatArray, least: float) -> FloatArray:
+    """Return `total` less `part`, with at least the share `least` of `total` left in each direction."""
     shares, vectors = eigh(part, total)
     back = np.linalg.inv(vectors)
     return (back.T * np.maximum(1.0 - shares, least)) @ back

@@ -1,4 +1,4 @@
-"""Who is enrolled, who is searched for, and who is learned from: never a person of both."""
+"""Roles of scans in a trial: enrolled, searched for, and training; no person is both tested and used for training."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from shapespace.cohort.table import Table, list_names
 from shapespace.errors import InputError
 from shapespace.reprs import short_repr
 from shapespace.statistics.identity.rates import Pairs
-from shapespace.statistics.identity.scores import SCORES, refuse_unknown_scores, samples_of
+from shapespace.statistics.identity.scores import SCORES, check_score_names, samples_of
 from shapespace.types import BoolArray, FloatArray, IntArray
 
 ROLES = ("gallery", "probe", "train")
@@ -23,7 +23,7 @@ _FOLDS, _GROUPS = 4, 5  # folds of people, and groups for the calibration
 
 @dataclass(frozen=True, kw_only=True)
 class IdentityConfig:
-    """Who is compared with whom, and how.
+    """Roles of scans, and options of the comparison.
 
     Args:
         subject: column of the subjects.
@@ -37,8 +37,8 @@ class IdentityConfig:
         scores: scores among `plda`, `cosine`, `mahalanobis` and `distance`; the summary reports the first (default:
             all).
         modes: number of leading coefficients of identity to use (default: all).
-        curve: also compute the equal error rate for these numbers of modes.
-        by: also report results for each value of this column of the probes.
+        curve: numbers of modes for which the equal error rate is also computed.
+        by: column of the probes, for whose values results are also reported.
         uncertainty: whether the PLDA score uses the estimated error of each fit.
         draws: number of bootstrap samples of subjects, from which intervals are computed.
         seed: seed of folds and bootstrap samples.
@@ -66,7 +66,7 @@ class IdentityConfig:
 
 @dataclass(frozen=True)
 class Round:
-    """Rows of a cohort: those learned from, and those of other people who are compared."""
+    """Rows of a cohort: training rows, and the compared rows of other people."""
 
     training: tuple[int, ...]
     gallery: tuple[int, ...]
@@ -78,13 +78,13 @@ class Trial:
     """A cohort ready to be compared.
 
     Args:
-        cohort: the scans of which all is known that is used.
-        people: names of all.
-        person: (N,) number of whom each scan shows.
-        rounds: that are compared; people learned from are in none of their round's gallery and probes.
-        group: (P,) of each person, for calibration on people of other groups.
+        cohort: scans without missing values in the used columns.
+        people: names of all people.
+        person: (N,) number of the person that each scan shows.
+        rounds: compared rounds; the training people of a round are not in its gallery and probes.
+        group: (P,) group of each person, for calibration on people of other groups.
         all_pairs: whether there is no gallery, and each scan is compared with each other.
-        notes: what the user should know.
+        notes: remarks for the user.
     """
 
     cohort: Cohort
@@ -99,15 +99,15 @@ class Trial:
 
     @cached_property
     def subjects(self) -> tuple[str, ...]:
-        """(N,) whom each scan shows."""
+        """(N,) name of the person that each scan shows."""
         return tuple(self.people[int(k)] for k in self.person)
 
     @property
     def tested(self) -> BoolArray:
-        """(P,) who is compared."""
+        """(P,) whether each person is compared."""
         out = np.zeros(len(self.people), dtype=np.bool_)
-        for one in self.rounds:
-            out[self.person[[*one.gallery, *one.probes]]] = True
+        for round_ in self.rounds:
+            out[self.person[[*round_.gallery, *round_.probes]]] = True
         return out
 
     def pairs(self, round_: Round) -> tuple[Pairs, IntArray]:
@@ -124,7 +124,7 @@ def rows_of(table: Table, expression: str) -> list[int]:
     """Return the rows of a table that an expression such as `expression=neutral` names.
 
     Raises:
-        InputError: it is none, there is no such column, or it names no row.
+        InputError: the expression is invalid, there is no such column, or it names no row.
     """
     column, sign, text = _parts_of(expression)
     values = {value.strip() for value in text.split(",")}
@@ -145,18 +145,18 @@ def _parts_of(expression: str) -> tuple[str, str, str]:
 
 
 def trial_of(cohort: Cohort, config: IdentityConfig, *, enrol: bool = False) -> Trial:
-    """Return who is compared with whom.
+    """Return the roles of scans, and the rounds of the comparison.
 
     Args:
-        cohort: the scans.
-        config: who is who.
-        enrol: whether there must be a gallery; without one, the first scan of each person is it.
+        cohort: cohort of the scans.
+        config: roles of the scans.
+        enrol: whether there must be a gallery; if none is named, it is the first scan of each person.
 
     Raises:
-        InputError: columns or scores that are not there, people who are both tested and learned from, or too few of
-            them.
+        InputError: columns or scores that do not exist, people who are both tested and used for training, or too few
+            people.
     """
-    refuse_unknown_scores(config.scores)
+    check_score_names(config.scores)
     role = config.role
     if role is None and "role" in cohort.table.columns and not (config.gallery or config.probe or config.train):
         role = "role"
@@ -174,8 +174,8 @@ def trial_of(cohort: Cohort, config: IdentityConfig, *, enrol: bool = False) -> 
     both = sorted({subjects[row] for row in tested} & {subjects[row] for row in training})
     if both:
         raise InputError(
-            f"{table.where}: {list_names(both)} {'is' if len(both) == 1 else 'are'} both tested and learned from; put "
-            "all scans of a subject on one side."
+            f"{table.where}: {list_names(both)} {'is' if len(both) == 1 else 'are'} both tested and learned from; use "
+            "all scans of a subject for only one of the two."
         )
     if enrol and not gallery:
         first = {int(person[row]): row for row in reversed(probes)}
@@ -195,7 +195,7 @@ def trial_of(cohort: Cohort, config: IdentityConfig, *, enrol: bool = False) -> 
         all_pairs=all_pairs,
         notes=tuple(notes),
     )
-    _refuse_too_few(trial, table)
+    _check_enough_scans(trial, table)
     return trial
 
 
@@ -205,13 +205,13 @@ def scores_of(
     """Yield each round with the (G, P) scores of its gallery and probes by name.
 
     Raises:
-        InputError: too few people to learn from, or more modes than there are.
+        InputError: too few training people, or too many modes.
     """
-    for one in trial.rounds:
-        samples = samples_of(trial.cohort, trial.subjects, one.training, uncertainty=config.uncertainty)
+    for round_ in trial.rounds:
+        samples = samples_of(trial.cohort, trial.subjects, round_.training, uncertainty=config.uncertainty)
         samples = samples.leading(modes)
-        training, gallery, probes = (samples.take(rows) for rows in (one.training, one.gallery, one.probes))
-        yield one, {name: SCORES[name](training)(gallery, probes) for name in config.scores}
+        training, gallery, probes = (samples.take(rows) for rows in (round_.training, round_.gallery, round_.probes))
+        yield round_, {name: SCORES[name](training)(gallery, probes) for name in config.scores}
 
 
 def _roles(table: Table, role: str | None, config: IdentityConfig) -> tuple[list[int], list[int], list[int]]:
@@ -252,7 +252,7 @@ def _rounds(
         parts = config.folds or max(min(_FOLDS, len(tested) // 2), 1)
         if config.folds and not 2 <= config.folds <= len(tested) // 2:
             raise InputError(
-                f"{len(tested)} subjects cannot be split into {config.folds} folds; each needs two of them, and two "
+                f"{len(tested)} subjects cannot be split into {config.folds} folds; each needs two subjects, and two "
                 "folds are the least."
             )
         if parts < 2:
@@ -272,11 +272,11 @@ def _rounds(
     return group, tuple(rounds)
 
 
-def _refuse_too_few(trial: Trial, table: Table) -> None:
+def _check_enough_scans(trial: Trial, table: Table) -> None:
     tested = int(trial.tested.sum())
     if tested < 2:
         raise InputError(f"{table.where}: {tested} subject is compared, but at least two are needed.")
-    if not any(trial.pairs(one)[0].same.any() for one in trial.rounds):
+    if not any(trial.pairs(round_)[0].same.any() for round_ in trial.rounds):
         raise InputError(
             f"{table.where}: no two of the compared scans are of one subject; add repeated scans of subjects."
         )

@@ -1,5 +1,5 @@
-"""Are two scans of one person: error rates of verification with their spread over people, and calibrated likelihood
-ratios."""
+"""Verification of identity: error rates of the decision whether two scans show one person, with their spread over
+people, and calibrated likelihood ratios."""
 
 from __future__ import annotations
 
@@ -54,10 +54,10 @@ class VerificationRates:
     Args:
         name: name of the score.
         score: (M,) score of each pair.
-        llr: (M,) calibrated log likelihood ratios, natural; None where there are too few people to calibrate.
+        llr: (M,) calibrated log likelihood ratios, natural; None if there are too few people to calibrate.
         roc: ROC curve.
         eer: equal error rate.
-        tar: FAR -> TAR; without a value where there are too few impostor pairs to say.
+        tar: FAR -> TAR; no value if there are too few impostor pairs.
         cllr: cost of the calibrated ratios, in bits.
         cllr_min: cost after the best monotone calibration.
         band: (2, 61) ends of the interval of TAR at the FAR of `GRID`.
@@ -106,10 +106,10 @@ class VerificationResult(AnalysisResult):
     config: IdentityConfig
 
     def __getitem__(self, name: str) -> VerificationRates:
-        return next(one for one in self.scores if one.name == name)
+        return next(rates for rates in self.scores if rates.name == name)
 
     def __repr__(self) -> str:
-        rates = list_briefly([f"{one.name}: EER {one.eer.briefly()}" for one in self.scores])
+        rates = list_briefly([f"{rates.name}: EER {rates.eer.briefly()}" for rates in self.scores])
         return f"<VerificationResult of {len(self.people)} subjects; {rates}>"
 
 
@@ -121,10 +121,10 @@ def verify(
     Args:
         cohort: scans with a column that identifies the person.
         config: roles of the scans; None compares all with all, by folds of the people.
-        progress: called with (done, total).
+        progress: function called with (done, total).
 
     Raises:
-        InputError: as `trial_of`, or too few people to learn from.
+        InputError: invalid roles, see `trial_of`, or too few training people.
         ShapespaceError: scikit-learn is not installed.
     """
     require(cohort, Cohort, "verify", "read one with shapespace.read_cohort")
@@ -143,7 +143,7 @@ def verify(
                  curve={modes: Sweep(curves[modes][name], pairs.same).roc().eer for modes in curves})
         for name, score in scores.items()
     )  # fmt: skip
-    n_training = min(len({trial.subjects[row] for row in one.training}) for one in trial.rounds)
+    n_training = min(len({trial.subjects[row] for row in round_.training}) for round_ in trial.rounds)
     return VerificationResult(
         scores=rates, pairs=pairs, people=trial.people, trained_on=n_training, trial=trial, config=config
     )
@@ -177,12 +177,12 @@ def verification_rates(
     Args:
         name: name of the score.
         score: (M,) score of each pair.
-        pairs: the pairs.
+        pairs: compared pairs.
         group: (P,) group of each person, for calibration on people of other groups.
-        people: (draws, P) from `people_drawn`.
+        people: (draws, P) bootstrap samples from `people_drawn`.
         chosen: value -> (M,) pairs of a subgroup.
         curve: number of modes -> EER.
-        on_draw: called after each draw.
+        on_draw: function called after each draw.
 
     Raises:
         InputError: no pairs of one person or of two, or scores that are not finite.
@@ -232,7 +232,7 @@ def _figures(rates: Roc) -> FloatArray:
 
 
 def _rate_estimates(roc: Roc, pairs: Pairs, drawn: FloatArray) -> tuple[RateEstimate, dict[float, RateEstimate]]:
-    """Return EER and TAR at each FAR with their intervals; no value where no impostor pair may be accepted."""
+    """Return EER and TAR at each FAR with their intervals; no value if no impostor pair may be accepted."""
     impostors = int((~pairs.same).sum())
     tar = {
         far: rate_estimate(float(roc.tar_at(far)), drawn[:, 1 + k], pairs.genuine_people)
@@ -244,19 +244,19 @@ def _rate_estimates(roc: Roc, pairs: Pairs, drawn: FloatArray) -> tuple[RateEsti
 
 
 def _with_value(values: tuple[str, ...], value: str, pairs: Pairs, *, all_pairs: bool) -> BoolArray:
-    """Return (M,) which pairs have a value: their probe, or one of both where there is no gallery."""
-    has: BoolArray = np.array([one == value for one in values], dtype=np.bool_)
+    """Return (M,) whether each pair has a value: its probe, or one of its scans if there is no gallery."""
+    has: BoolArray = np.array([cell == value for cell in values], dtype=np.bool_)
     probe = has[pairs.rows[:, 1]]
     return probe | has[pairs.rows[:, 0]] if all_pairs else probe
 
 
-# Scores as likelihood ratios, and what they cost: Cllr, and Cllr-min of the best monotone calibration
+# Scores as likelihood ratios, and their cost: Cllr, and Cllr-min of the best monotone calibration
 
 _NEEDS, _INSTALL = "Calibration of scores", "'shapespace[statistics]'"
 
 
 def cllr(llr: FloatArray, same: BoolArray, weights: FloatArray | None = None) -> float:
-    """Return the cost of log likelihood ratios (M,), natural, in bits; both kinds of pairs count alike.
+    """Return the cost of log likelihood ratios (M,), natural, in bits; both kinds of pairs have equal weights.
 
     It is the mean information that is missed: 0 if all is known, 1 if nothing. Source: Brummer and du Preez,
     "Application-independent evaluation of speaker detection", Computer Speech and Language 20, 2006.
@@ -267,7 +267,7 @@ def cllr(llr: FloatArray, same: BoolArray, weights: FloatArray | None = None) ->
 
 
 def cllr_min(score: FloatArray, same: BoolArray) -> float:
-    """Return the least cost of any rising function of the scores, by pooling adjacent violators.
+    """Return the smallest cost of any rising function of the scores, by pooling adjacent violators.
 
     Raises:
         ShapespaceError: scikit-learn is not installed.
@@ -286,12 +286,12 @@ def calibrated(score: FloatArray, pairs: Pairs, group: IntArray) -> FloatArray |
     """Return the log likelihood ratio (M,), natural, of each score, by a logistic regression on other people.
 
     Args:
-        score: (M,).
-        pairs: of whom.
-        group: (P,) of each person; a pair is calibrated by pairs of people of neither's group.
+        score: (M,) scores.
+        pairs: compared pairs.
+        group: (P,) group of each person; a pair is calibrated by pairs of people of neither's group.
 
     Returns:
-        None where some groups leave no pairs of both kinds to learn from.
+        None if some groups leave no pairs of both kinds for calibration.
 
     Raises:
         ShapespaceError: scikit-learn is not installed.
@@ -305,7 +305,7 @@ def calibrated(score: FloatArray, pairs: Pairs, group: IntArray) -> FloatArray |
         if pairs.same[known].all() or not pairs.same[known].any():
             return None
         mean, scale = score[known].mean(), score[known].std() or 1.0
-        # Both kinds of pairs count alike, so the log odds are the log likelihood ratio.
+        # Both kinds of pairs have equal weights, so the log odds are the log likelihood ratio.
         rule = make(class_weight="balanced").fit((score[known, None] - mean) / scale, pairs.same[known])
         out[own] = rule.decision_function((score[own, None] - mean) / scale)
     return out

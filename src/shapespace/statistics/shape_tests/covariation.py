@@ -53,9 +53,9 @@ def fit_pls(
         columns: columns of numbers, as the first block; shape is the second.
         modules: table of landmark,module or vertex,module with all landmarks, or vertices (from 0), of each module.
         permutations: number of permutations of the shapes in one block, including the observed data.
-        seed: of the permutations.
+        seed: seed of the permutations.
         drop_missing: exclude shapes with missing values in the table (default: an error).
-        progress: called with (done, total).
+        progress: function called with (done, total).
 
     Raises:
         InputError: columns and modules or neither, columns that are no numbers, a block without variance, or modules
@@ -131,9 +131,9 @@ def estimate_modularity(
         modules: table of landmark,module or vertex,module with all landmarks, or vertices (from 0), of each module.
         permutations: number of permutations of the points among modules, including the observed data; the interval is
             from as many bootstrap samples of shapes.
-        seed: of the permutations and the bootstrap.
+        seed: seed of the permutations and the bootstrap.
         drop_missing: has no effect, because no column of the table is used.
-        progress: called with (done, total).
+        progress: function called with (done, total).
 
     Raises:
         InputError: modules that these shapes do not have, too many points, or modules without covariances.
@@ -190,7 +190,7 @@ def compare_effect_sizes(first: Statistic, second: Statistic) -> Statistic:
     """
     if first.z is None or second.z is None or min(len(first.arrangements), len(second.arrangements)) < 3:
         raise InputError("Effect sizes are compared by Z, which needs permutations; repeat both tests with them.")
-    z = (first.z - second.z) / math.sqrt(sum(1 - 1 / (len(one.arrangements) - 1) for one in (first, second)))  # M44
+    z = (first.z - second.z) / math.sqrt(sum(1 - 1 / (len(own.arrangements) - 1) for own in (first, second)))  # M44
     return Statistic(name=f"difference of Z of {first.name}", value=z, z=z, p=math.erfc(abs(z) / math.sqrt(2)))
 
 
@@ -204,7 +204,7 @@ def _mean_and_pairs(
 
 
 def _modules(cohort: Cohort, path: Path) -> tuple[Cohort, dict[str, list[int]]]:
-    """Read the points of each module, and return them with the cohort, with a note where points are left out.
+    """Read the points of each module, and return them with the cohort, with a note if points are excluded.
 
     Raises:
         FileError: the file cannot be read, or is no table of modules.
@@ -226,9 +226,9 @@ def _modules(cohort: Cohort, path: Path) -> tuple[Cohort, dict[str, list[int]]]:
     if len(points) < 2 or min(map(len, points.values())) < 2 or len(cohort) < 3:
         raise InputError(f"{path}: covariation needs 3 shapes or more, and two modules of two {noun} or more each.")
     if cohort.analysed is not None and not cohort.analysed[flat].all():
-        raise InputError(f"{path} lists {noun} that are missing in most shapes; leave them out.")
+        raise InputError(f"{path} lists {noun} that are missing in most shapes; remove them.")
     left = cohort.n_vertices - len(flat)
-    note = f"{left:,} of {cohort.n_vertices:,} {noun} belong to no module and are left out."
+    note = f"{left:,} of {cohort.n_vertices:,} {noun} belong to no module and are excluded."
     return (replace(cohort, notes=(*cohort.notes, note)) if left else cohort), points
 
 

@@ -60,12 +60,13 @@ def compare_disparity(
         formula: linear model about whose predictions disparity is measured (default: ~ 1, the mean of all shapes).
         partial: partial disparities (Foote 1993): sums of squares about the mean of all shapes, divided by the number
             of all shapes - 1, so that those of the groups add up to the total disparity.
-        residuals: of a formula: `scaled` to the variance of errors, in permutations after the model is fitted again; or
-            `raw`, as geomorph, which are smaller in small groups, so that equal groups differ.
+        residuals: treatment of the residuals of a formula: `scaled` to the variance of errors, in permutations after
+            the model is fitted again; or `raw`, as geomorph, which are smaller in small groups, so that equal groups
+            differ.
         permutations: number of permutations, including the observed data.
-        seed: of the permutations, and of the bootstrap samples of the intervals.
+        seed: seed of the permutations, and of the bootstrap samples of the intervals.
         drop_missing: exclude shapes with missing values in the table (default: an error).
-        progress: called with (done, total).
+        progress: function called with (done, total).
 
     Raises:
         InputError: no such column, a group of one shape, a formula that cannot be read, or partial with a formula.
@@ -76,7 +77,7 @@ def compare_disparity(
         True
     """
     if partial and formula is not None:
-        raise InputError("Partial disparities are about the mean of all shapes; leave out --formula or --partial.")
+        raise InputError("Partial disparities are about the mean of all shapes; remove --formula or --partial.")
     cohort, groups = groups_of(cohort, group, drop_missing, 2, "a variance", formula)
     n, design = len(cohort), design_of(formula, cohort.table) if formula else None
     q = span(np.column_stack([np.ones(n), design.matrix]) if design else np.ones((n, 1)))
@@ -85,14 +86,14 @@ def compare_disparity(
     free = np.maximum(1 - (q**2).sum(axis=1), _TINY) if scaled else np.ones(n)
     squares = (residual**2).sum(axis=1) / free
     shares = groups.indicator / (np.full(len(groups.names), n - 1.0) if partial else groups.counts)
-    refit = _refitted(q, residual / np.sqrt(free)[:, None], shares / free[:, None])
+    refit = _make_refit(q, residual / np.sqrt(free)[:, None], shares / free[:, None])
     # Rows of residuals are permuted, so their squared norms are.
     variances = permuted(n, permutations, seed, refit if scaled else lambda rows: squares @ shares[rows], progress)
     variances[0] = squares @ shares  # M20
     name = "partial disparity" if partial else "Procrustes variance"
     limits = [
-        Statistic(name=name, tested=one, value=float(value), low=float(low * value), high=float(high * value))
-        for one, value, (low, high) in zip(groups.names, variances[0], _intervals(groups, squares, seed), strict=True)
+        Statistic(name=name, tested=label, value=float(value), low=float(low * value), high=float(high * value))
+        for label, value, (low, high) in zip(groups.names, variances[0], _intervals(groups, squares, seed), strict=True)
     ]
     differences = np.abs([variances[:, a] - variances[:, b] for a, b in groups.pairs])
     rows = [(s.tested, int(count), s.value, s.low, s.high) for s, count in zip(limits, groups.counts, strict=True)]
@@ -106,15 +107,15 @@ def compare_disparity(
     )  # fmt: skip
 
 
-def _refitted(q: FloatArray, rows_of_errors: FloatArray, weights: FloatArray) -> Callable[[Orders], FloatArray]:
-    """Return a function of orders (b, N) that permutes errors, fits the model again and sums its squared residuals.
+def _make_refit(q: FloatArray, rows_of_errors: FloatArray, weights: FloatArray) -> Callable[[Orders], FloatArray]:
+    """Return a function of orders (b, N) that permutes errors, fits the model again and sums the squared residuals.
 
-    The sums have the degrees of freedom of the observed ones, so that variances of small groups vary as they do.
+    The sums have the degrees of freedom of the observed sums, so that variances of small groups vary as observed.
 
     Args:
         q: (N, m) orthonormal columns of the model.
         rows_of_errors: (N, K) residuals scaled to the variance of errors.
-        weights: (N, G) of the squared residuals in the sum of each group.
+        weights: (N, G) weights of the squared residuals in the sum of each group.
     """
     columns = np.hstack([q, *(q * own[:, None] for own in weights.T)])
     inner, squares = np.einsum("ng,nm,nk->gmk", weights, q, q), (rows_of_errors**2).sum(axis=1)
@@ -131,7 +132,7 @@ def _refitted(q: FloatArray, rows_of_errors: FloatArray, weights: FloatArray) ->
 def _intervals(groups: Groups, squares: FloatArray, seed: int) -> FloatArray:
     """Return factors (G, 2) from means of squared distances (N,) to the limits of their 95 % interval.
 
-    They are of the bootstrap t of the logarithm of the mean, since variances are skewed.
+    The intervals are those of the bootstrap t of the logarithm of the mean, since variances are skewed.
     """
     drawn = groups.resamples(_DRAWS, seed)[:, None, :] * groups.indicator.T
     mean, second = (drawn @ squares**power / groups.counts for power in (1, 2))
@@ -160,9 +161,9 @@ def compare_means_and_covariances(
         components: number of principal components of the residuals in which covariance matrices are compared
             (default: a third of the smallest group, at most 10).
         permutations: number of permutations, including the observed data.
-        seed: of the permutations.
+        seed: seed of the permutations.
         drop_missing: exclude shapes with missing values in the table (default: an error).
-        progress: called with (done, total).
+        progress: function called with (done, total).
 
     Raises:
         InputError: no such column, a group of fewer than three shapes, or components with a singular covariance.
@@ -175,7 +176,7 @@ def compare_means_and_covariances(
     cohort, groups = groups_of(cohort, group, drop_missing, 3, "a covariance matrix")
     n, counts = len(cohort), groups.counts
     centred = cohort.coefficients - cohort.coefficients.mean(axis=0)
-    # Residuals of spatial medians, since an outlier moves a mean and so the residuals of its whole group.
+    # Residuals of spatial medians, since an outlier moves the mean and so all residuals of its group.
     residual, scale = np.empty_like(centred), np.empty((n, 1))
     for own in (groups.codes == k for k in range(len(counts))):
         residual[own] = centred[own] - _spatial_median(centred[own])
@@ -271,12 +272,12 @@ def assess_equivalence(
     Args:
         cohort: the shapes.
         group: columns whose classes, or combinations of classes, are the groups.
-        margin: Procrustes distance, in the unit of the data, from which on means are not equivalent.
-        margin_sd: the same in standard deviations within groups, the root of the pooled Procrustes variance.
+        margin: smallest Procrustes distance, in the unit of the data, of means that are not equivalent.
+        margin_sd: margin in standard deviations within groups, the root of the pooled Procrustes variance.
         permutations: number of bootstrap samples, including the observed data.
-        seed: of the bootstrap samples.
+        seed: seed of the bootstrap samples.
         drop_missing: exclude shapes with missing values in the table (default: an error).
-        progress: called with (done, total).
+        progress: function called with (done, total).
 
     Raises:
         InputError: no margin or two, a margin that is not above 0, fewer than 20 bootstrap samples, no such column, or
@@ -296,18 +297,18 @@ def assess_equivalence(
     distances = _mean_distances(cohort.coefficients, groups, groups.resamples(permutations, seed))
     step = StepCounter(len(distances), progress)
     tests, limits, rows, notes = list[Statistic](), list[Statistic](), list[tuple[Any, ...]](), list[str]()
-    for one, pair in zip(distances, groups.pair_names, strict=True):
-        limit = given * (1.0 if margin_sd is None else one.deviation)
-        t, bound = one.t(limit, relative=margin_sd is not None), one.upper_bound()
+    for distance, pair in zip(distances, groups.pair_names, strict=True):
+        limit = given * (1.0 if margin_sd is None else distance.deviation)
+        t, bound = distance.t(limit, relative=margin_sd is not None), distance.upper_bound()
         tests.append(Statistic.of("t of equivalence", t, pair, tail="lower", z="none"))
         name = "corrected Procrustes distance"
-        limits.append(Statistic(name=name, tested=pair, value=one.corrected, low=0.0, high=bound))
+        limits.append(Statistic(name=name, tested=pair, value=distance.corrected, low=0.0, high=bound))
         equivalent = "yes" if (t <= t[0]).mean() <= LEVEL else "not shown"
-        rows.append((pair, one.length, one.corrected, bound, limit, tests[-1].p, equivalent))
-        if limit < _CLEAR_MARGIN * one.noise:
+        rows.append((pair, distance.length, distance.corrected, bound, limit, tests[-1].p, equivalent))
+        if limit < _CLEAR_MARGIN * distance.noise:
             notes.append(
-                f"{pair}: the margin {limit:.3g} is below {_CLEAR_MARGIN:g} times {one.noise:.3g}, the distance that "
-                "sampling alone gives; with so few shapes equivalence within it can hardly be shown."
+                f"{pair}: the margin {limit:.3g} is below {_CLEAR_MARGIN:g} times {distance.noise:.3g}, the distance "
+                "by sampling alone; with so few shapes equivalence within it can hardly be shown."
             )
         step.add()
     columns = ("pair", "Procrustes distance", "corrected distance", "upper 95 % bound", "margin", "p", "equivalent")
@@ -345,14 +346,14 @@ class _MeanDistance:
 
     @property
     def corrected(self) -> float:
-        """Distance without the bias by sampling; 0 where it is below this bias."""
+        """Distance without the bias by sampling; 0 if it is below this bias."""
         return float(np.sqrt(max(self.length**2 - self.noise**2, 0.0)))  # M24
 
     def t(self, limit: float, *, relative: bool = False) -> FloatArray:
-        """Return the (B,) squared distances less that of a limit by their standard error, the observed one first.
+        """Return the (B,) squared distances less that of a limit by their standard error, the observed value first.
 
         In the bootstrap samples the means differ by the limit, which is `relative` to the estimated variance or not. An
-        observed distance below that by sampling alone counts as this, since no sample shows smaller ones.
+        observed distance below the distance by sampling alone counts as the latter, since no sample shows smaller ones.
         """
         # M25
         scale = limit / self.length
@@ -380,7 +381,7 @@ def _mean_distances(coefficients: FloatArray, groups: Groups, drawn: FloatArray)
     distances: list[_MeanDistance] = []
     for pair in map(list, groups.pairs):
         size, own = counts[pair], variances[:, pair]
-        error, share = (one[:, pair[0]] - one[:, pair[1]] for one in (off, shares))
+        error, share = (values[:, pair[0]] - values[:, pair[1]] for values in (off, shares))
         difference = means[pair[0]] - means[pair[1]]
         along, weights = residual @ difference, (groups.indicator[:, pair] / size**2).sum(axis=1)
         within = float(own[0] @ (size - 1) / (size.sum() - 2))
@@ -409,14 +410,14 @@ def discriminate(
     Args:
         cohort: the shapes.
         group: columns whose classes, or combinations of classes, are the groups.
-        components: number of principal components, computed without the shape that is classified (default: all, or
-            where the covariance within groups is singular, those of 95 % of the variance, at most half of the shapes
-            minus the groups).
+        components: number of principal components, computed without the shape that is classified (default: all, or, if
+            the covariance within groups is singular, those of 95 % of the variance, at most half of the shapes minus
+            the groups).
         priors: prior probabilities of the groups: `proportional` to their sizes, or `equal`.
         permutations: number of permutations of the groups, including the observed data.
-        seed: of the permutations.
+        seed: seed of the permutations.
         drop_missing: exclude shapes with missing values in the table (default: an error).
-        progress: called with (done, total).
+        progress: function called with (done, total).
 
     Raises:
         InputError: no such column, a group of fewer than three shapes, or a covariance within groups that is singular.
@@ -436,26 +437,28 @@ def discriminate(
             f"In some direction of {used} principal components the shapes of each group are equal, so the covariance "
             "within groups is singular; take fewer with --components."
         )
-    rows = np.concatenate([one for _, one in orders(n, permutations, seed)])
+    rows = np.concatenate([order for _, order in orders(n, permutations, seed)])
     codes, labels = groups.codes[rows], groups.labels(rows)[:, 1:].reshape(-1, n)
 
     def sums(values: FloatArray) -> FloatArray:
-        # Values have the mean 0, so the sum of the first group follows from those of the others.
+        # Values have the mean 0, so the sum of the first group follows from those of the other groups.
         others = (labels @ values).reshape(len(rows), g - 1, -1)
         return np.concatenate([-others.sum(axis=1, keepdims=True), others], axis=1)
 
     means = sums(scores) / counts[:, None]
-    products = _within(sums(scores[:, :used] / np.sqrt(squares[:used])) / counts[:, None], np.zeros(used), counts)
+    products = _within_products(
+        sums(scores[:, :used] / np.sqrt(squares[:used])) / counts[:, None], np.zeros(used), counts
+    )
     diagonal = products.diagonal(axis1=1, axis2=2)
     lengths = [(n - g) * (diagonal[:, a] + diagonal[:, b] - 2 * products[:, a, b]) for a, b in groups.pairs]
     logs = np.log(counts / n if priors == "proportional" else np.full(g, 1 / g))
     correct, support, posterior = np.zeros(permutations), np.zeros(permutations), np.empty((n, g))
     step = StepCounter(n, progress)
     for k in range(n):
-        whitened = _whitened_without(scores, squares, used, k)
+        whitened = _whiten_without(scores, squares, used, k)
         shape, whitened[k] = whitened[k].copy(), 0.0
         sizes = counts - (codes[:, k, None] == np.arange(g))
-        products = _within(sums(whitened) / sizes[..., None], shape, sizes)
+        products = _within_products(sums(whitened) / sizes[..., None], shape, sizes)
         # M27
         score = logs + (n - 1 - g) * (products[..., g] - products.diagonal(axis1=1, axis2=2) / 2)
         correct += score.argmax(axis=1) == codes[:, k]
@@ -498,12 +501,12 @@ def discriminate(
     )  # fmt: skip
 
 
-def _within(means: FloatArray, shape: FloatArray, counts: Orders) -> FloatArray:
+def _within_products(means: FloatArray, shape: FloatArray, counts: Orders) -> FloatArray:
     """Return the products (b, G, G + 1) of group means with each other and a shape, by the scatter within.
 
     Args:
-        means: (b, G, q) of the groups, in coordinates where the mean is 0 and the total scatter the identity.
-        shape: (q,) in these coordinates.
+        means: (b, G, q) means of the groups, in coordinates with a mean of 0 and the identity as total scatter.
+        shape: (q,) shape in these coordinates.
         counts: (b, G) or (G,) number of shapes of each group.
     """
     # The scatter within is the identity less that of the means, so that systems of G equations are solved (M26).
@@ -513,16 +516,16 @@ def _within(means: FloatArray, shape: FloatArray, counts: Orders) -> FloatArray:
     return np.asarray(solved, dtype=np.float64)
 
 
-def _whitened_without(scores: FloatArray, squares: FloatArray, components: int, row: int) -> FloatArray:
-    """Return coordinates (N, q), of scatter 1, on the first q principal components of all shapes but one.
+def _whiten_without(scores: FloatArray, squares: FloatArray, components: int, row: int) -> FloatArray:
+    """Return coordinates (N, q), of scatter 1, on the first q principal components of all shapes except one.
 
     Without a shape, the scatter changes by a matrix of rank one, so that its eigenvalues solve the secular equation.
 
     Args:
-        scores: (N, r) on all principal components of all shapes.
-        squares: (r,) their scatter, falling.
-        components: q.
-        row: the shape that is left out.
+        scores: (N, r) scores on all principal components of all shapes.
+        squares: (r,) scatter of the scores, descending.
+        components: number q of principal components.
+        row: row of the shape that is omitted.
     """
     # M28
     n, tiny = len(scores), _TINY * np.sqrt(squares)
@@ -547,7 +550,7 @@ def groups_of(
 
 
 def _pairs(name: str, groups: Groups, values: FloatArray, weights: FloatArray | None = None) -> list[Statistic]:
-    """Return the statistics of pairs of groups (pairs, P), after their weighted root mean square if there are some."""
+    """Return the statistics of pairs of groups (pairs, P), with weights after their weighted root mean square."""
     pairs = pair_statistics(name, values, groups.pair_names)
     if weights is None or len(pairs) < 2:
         return pairs

@@ -36,7 +36,7 @@ from shapespace.types import BoolArray, FloatArray
 
 _ALIASED = 1e-8  # relative length; columns below it follow from others, and estimates below it are equal
 _MOST_COORDINATES = 20_000_000
-"""Size-corrected coordinates that are written; more fill gigabytes, and the coefficients are written alone."""
+"""Largest number of size-corrected coordinates to write; with more, only the coefficients are written."""
 _BLOCK = 20_000  # vertices at a time; bounds memory
 
 
@@ -65,9 +65,9 @@ def compare_trajectories(
         null: reduced model whose residuals are permuted, `1` for the mean shape (default: without the last term).
         residuals: `scaled` to the variance of errors, or `raw`, as RRPP, which are smaller than errors.
         permutations: number of permutations, including the observed data.
-        seed: of the permutations.
+        seed: seed of the permutations.
         drop_missing: exclude shapes with missing values in the table (default: an error).
-        progress: called with (done, total).
+        progress: function called with (done, total).
 
     Raises:
         InputError: no such column, a group without shapes at a point, fewer than two points, or models that are not
@@ -80,7 +80,7 @@ def compare_trajectories(
     """
     if formula is None:
         formula = " * ".join(_class_factor(cohort, column) for column in (*group, points))
-    cohort = _complete(cohort, [formula, null], [*group, points], drop_missing=drop_missing)
+    cohort = _complete_cohort(cohort, [formula, null], [*group, points], drop_missing=drop_missing)
     groups, texts = Groups.of(cohort, group), cohort.table.texts(points)
     stages = order or tuple(sorted(set(texts), key=float if cohort.table.kind(points) == "number" else str))
     if set(stages) != set(texts) or len(stages) < 2 or len(set(stages)) < len(stages):
@@ -94,7 +94,7 @@ def compare_trajectories(
     if len(empty):
         raise InputError(
             f"{cohort.table.where}: the group {groups.names[empty[0] // p]!r} has no shape with {points} "
-            f"{stages[empty[0] % p]!r}; leave out the group or the point."
+            f"{stages[empty[0] % p]!r}; exclude the group or the point."
         )
     design, reduced, labels = _models(cohort, formula, null)
     estimator = _mean_estimator(design, np.eye(g * p)[cells])
@@ -102,7 +102,7 @@ def compare_trajectories(
     excess, is_long = _excess(steps, reduced, cohort)
     batches: list[FloatArray] = []
     observed, directions = np.zeros(0), np.zeros((g, 1))
-    for means in _permuted(estimator, reduced, cohort, residuals, permutations, seed, progress):
+    for means in _permute_estimates(estimator, reduced, cohort, residuals, permutations, seed, progress):
         paths = means.reshape(len(means), g, p, -1)
         observed = observed if observed.size else paths[0]
         length = np.linalg.norm(np.diff(paths, axis=2), axis=3).sum(axis=2)  # M31
@@ -115,7 +115,7 @@ def compare_trajectories(
                   _directions(axis, 1.0 / (steps**2).sum(axis=(1, 2)), groups, residuals)]  # fmt: skip
         directions = directions if batches else axis[0]
         if p > 2:
-            aligned = _aligned(centred)
+            aligned = _align_trajectories(centred)
             values.append(np.linalg.norm(aligned[:, one] - aligned[:, other], axis=(2, 3)).T)
         batches.append(np.array(values))
     names = ("difference of path length", "angle, degrees", "difference of trajectory shape")
@@ -153,7 +153,7 @@ def _directions(vectors: FloatArray, weights: FloatArray, groups: Groups, residu
 
 
 def _excess(estimators: FloatArray, reduced: FloatArray, cohort: Cohort) -> tuple[FloatArray, BoolArray]:
-    """Return by how much noise makes vectors (G, r, K) of the reduced model longer, and whose own exceed noise (G,).
+    """Return the excess (G, r, K) of noise in vectors of the reduced model, and whether those of a group exceed noise.
 
     Args:
         estimators: (G, r, N) of the r vectors of each group, which are shortened together.
@@ -170,11 +170,11 @@ def _excess(estimators: FloatArray, reduced: FloatArray, cohort: Cohort) -> tupl
     return vectors - without_noise(flat, noise).reshape(vectors.shape), is_long
 
 
-def _aligned(centred: FloatArray) -> FloatArray:
+def _align_trajectories(centred: FloatArray) -> FloatArray:
     """Return trajectories (b, G, P, P) of size 1 rotated to their mean, in the coordinates of the mean (M33)."""
     unit = centred / np.linalg.norm(centred, axis=(2, 3), keepdims=True)
     mean = unit.mean(axis=1, keepdims=True)
-    own, target = (_root(one @ one.swapaxes(2, 3)) for one in (unit, mean))
+    own, target = (_root(part @ part.swapaxes(2, 3)) for part in (unit, mean))
     u, _, vt = np.linalg.svd(target @ own)
     return own @ (u @ vt).swapaxes(2, 3)
 
@@ -207,9 +207,9 @@ def compare_pairs(
         null: reduced model whose residuals are permuted, `1` for the mean shape (default: without the last term).
         residuals: `scaled` to the variance of errors, or `raw`, as RRPP, which are smaller than errors.
         permutations: number of permutations, including the observed data.
-        seed: of the permutations.
+        seed: seed of the permutations.
         drop_missing: exclude shapes with missing values in the table (default: an error).
-        progress: called with (done, total).
+        progress: function called with (done, total).
 
     Raises:
         InputError: no such column, a covariate that is constant within a group, models that are not nested or leave no
@@ -221,7 +221,7 @@ def compare_pairs(
         True
     """
     numbers = [covariate] if covariate else []
-    cohort = _complete(cohort, [formula, null], group, drop_missing=drop_missing, numbers=numbers)
+    cohort = _complete_cohort(cohort, [formula, null], group, drop_missing=drop_missing, numbers=numbers)
     groups = Groups.of(cohort, group)
     design, reduced, labels = _models(cohort, formula, null)
     if covariate is None:
@@ -240,7 +240,7 @@ def compare_pairs(
     directions = estimator @ cohort.coefficients
     excess, is_long = _excess(estimator[:, None], reduced, cohort)
     one, other = np.array(groups.pairs).T
-    for vectors in _permuted(estimator, reduced, cohort, residuals, permutations, seed, progress):
+    for vectors in _permute_estimates(estimator, reduced, cohort, residuals, permutations, seed, progress):
         values = [np.linalg.norm(vectors[:, one] - vectors[:, other], axis=2).T]
         if covariate is not None:
             length = np.linalg.norm(vectors, axis=2)
@@ -275,9 +275,9 @@ def analyse_allometry(
         group: column whose classes may differ in mean and slope.
         separate: whether each group has its own slope in predicted lines and size-corrected shapes.
         permutations: number of permutations, including the observed data.
-        seed: of the permutations.
+        seed: seed of the permutations.
         drop_missing: exclude shapes with missing values in the table (default: an error).
-        progress: called with (done, total).
+        progress: function called with (done, total).
 
     Raises:
         InputError: no such column, a covariate that is constant, too few shapes, or separate slopes without groups.
@@ -292,11 +292,11 @@ def analyse_allometry(
     formula = quoted(covariate)
     if group is not None:
         formula += f" * {_class_factor(cohort, group)}"
-    cohort = _complete(cohort, [formula], [], drop_missing=drop_missing, numbers=[covariate])
+    cohort = _complete_cohort(cohort, [formula], [], drop_missing=drop_missing, numbers=[covariate])
     x, y = cohort.table.numbers(covariate), cohort.coefficients - cohort.coefficients.mean(axis=0)
     classes = ["all"] * len(cohort) if group is None else list(cohort.table.texts(group))
     names = sorted(set(classes))
-    indicator = np.array([[one == name for name in names] for one in classes], dtype=np.float64)
+    indicator = np.array([[label == name for name in names] for label in classes], dtype=np.float64)
     lines, within = _lines(indicator, x, covariate), less(x[:, None], indicator)
     step = StepCounter(3 if group else 1, progress)
     stratum = independent_stratum(cohort.coefficients, design_of(formula, cohort.table))
@@ -307,12 +307,12 @@ def analyse_allometry(
     own = slopes[indicator.argmax(axis=1)] if separate else np.repeat(slopes, len(x), axis=0)
     corrected = cohort.coefficients - (x - x.mean())[:, None] * own  # M38
     directions = [(x - x.mean()) @ y, within[:, 0] @ y]
-    scores = [y @ one / max(float(np.linalg.norm(one)), 1e-300) for one in directions]  # M36, M37
+    scores = [y @ direction / max(float(np.linalg.norm(direction)), 1e-300) for direction in directions]  # M36, M37
     line = np.linalg.svd(fitted - fitted.mean(axis=0), full_matrices=False)
     predicted = line[0][:, 0] * line[1][0]
     scores.append(predicted if predicted @ (x - x.mean()) >= 0 else -predicted)
     titles = ("regression score", "common allometric component", "predicted line")
-    rows = list(zip(cohort.names, classes, *(one.tolist() for one in (x, *scores)), strict=True))
+    rows = list(zip(cohort.names, classes, *(column.tolist() for column in (x, *scores)), strict=True))
     tables = (
         TablePart.of("Analysis of variance", ("term", "df", "sum of squares", "R²", "F", "Z", "p"),
                      [(t.term, t.df, t.squares, t.r2, t.f, t.z, t.p) for t in tests], percent=("R²",)),
@@ -331,7 +331,7 @@ def analyse_allometry(
         arrays["size_corrected"] = cohort.reference + (corrected @ cohort.basis).reshape(len(cohort), -1, 3)
     return ShapeTestResult(
         name="allometry", cohort=cohort, classes=(group,) if group else (),
-        statistics=[Statistic.of("F", one.arrangements, one.term) for one in tests],
+        statistics=[Statistic.of("F", test.arrangements, test.term) for test in tests],
         settings={"covariate": covariate, "group": group, "separate": separate, "permutations": permutations,
                   "seed": seed},
         tables=tables, figures=figures, arrays={"allometry.npz": arrays},
@@ -356,11 +356,11 @@ def measure_repeatability(
     Args:
         cohort: the shapes.
         subject: column of the subjects or specimens that were measured repeatedly.
-        session: column of sessions or observers, a systematic factor; all subjects must have all of them.
+        session: column of sessions or observers, a systematic factor; each subject must have all sessions.
         permutations: number of permutations, including the observed data.
-        seed: of the permutations.
+        seed: seed of the permutations.
         drop_missing: exclude shapes with missing values in the table (default: an error).
-        progress: called with (done, total).
+        progress: function called with (done, total).
 
     Raises:
         InputError: no such column, one subject, no replicates, or subjects without some sessions.
@@ -382,8 +382,8 @@ def measure_repeatability(
     occasions = None if session is None else Groups.of(cohort, [session])
     if occasions is not None and np.ptp(groups.indicator.T @ occasions.indicator) > 0:
         raise InputError(
-            f"{cohort.table.where}: the subjects of {subject!r} have different numbers of shapes of {session!r}; leave "
-            "out those without all sessions, or leave out --session."
+            f"{cohort.table.where}: the subjects of {subject!r} have different numbers of shapes of {session!r}; "
+            "exclude those without all sessions, or remove --session."
         )
     sessions = np.zeros(n, dtype=np.intp) if occasions is None else occasions.codes
     y = cohort.coefficients - cohort.coefficients.mean(axis=0)
@@ -404,7 +404,7 @@ def measure_repeatability(
     values = _repeatabilities(y, groups.codes, sessions)
     parts = [groups.codes != k for k in range(s)]
     left_out = [_repeatabilities(y[part], groups.codes[part], sessions[part]) for part in parts]
-    statistics = [_jackknifed(name, values[name], [one[name] for one in left_out]) for name in values]
+    statistics = [_jackknife(name, values[name], [part[name] for part in left_out]) for name in values]
     statistics.append(Statistic.of("F", f, subject))
     within = y - means_of(y, groups.codes)[groups.codes]
     error = within - (means_of(within, sessions)[sessions] if df[1] else 0.0)
@@ -435,7 +435,7 @@ def measure_repeatability(
 
 
 def _squares(y: FloatArray, subjects: Orders, sessions: Orders) -> tuple[list[float], tuple[int, int, int], float]:
-    """Return sums of squares and degrees of freedom of subjects, sessions and error, and shapes of a subject (mean)."""
+    """Return sums of squares and degrees of freedom of subjects, sessions and error, and shapes per subject (mean)."""
     codes, counts = np.unique(subjects, return_inverse=True, return_counts=True)[1:]
     n, s, m = len(y), len(counts), int(sessions.max())
     y = y - y.mean(axis=0)
@@ -445,7 +445,7 @@ def _squares(y: FloatArray, subjects: Orders, sessions: Orders) -> tuple[list[fl
 
 
 def _repeatabilities(y: FloatArray, subjects: Orders, sessions: Orders) -> dict[str, tuple[float, float]]:
-    """Return intraclass correlations (M39) of shapes, each with the mean number of shapes of a subject."""
+    """Return intraclass correlations (M39) of shapes, each with the mean number of shapes per subject."""
     (among, between, left), (s, m, free), k = _squares(y, subjects, sessions)
     ms, mw, me = among / s, (between + left) / (m + free), left / max(free, 1)
     out = {"ICC": ((ms - mw) / (ms + (k - 1) * mw), k)}
@@ -456,7 +456,7 @@ def _repeatabilities(y: FloatArray, subjects: Orders, sessions: Orders) -> dict[
     return out
 
 
-def _jackknifed(name: str, value: tuple[float, float], left_out: Sequence[tuple[float, float]]) -> Statistic:
+def _jackknife(name: str, value: tuple[float, float], left_out: Sequence[tuple[float, float]]) -> Statistic:
     """Return an intraclass correlation with the jackknife interval of its Fisher transform."""
     from scipy.stats import t  # loads much
 
@@ -464,7 +464,7 @@ def _jackknifed(name: str, value: tuple[float, float], left_out: Sequence[tuple[
         return 0.5 * float(np.log(max(1 + (k - 1) * r, 1e-12) / max(1 - r, 1e-12)))
 
     s, center = len(left_out), transform(*value)
-    each = np.array([transform(*one) for one in left_out])
+    each = np.array([transform(*estimate) for estimate in left_out])
     width = float(t.ppf(1 - LEVEL / 2, s - 1) * np.sqrt((s - 1) / s * ((each - each.mean()) ** 2).sum()))
     low, high = (
         (ratio - 1) / (ratio + value[1] - 1) for ratio in np.exp(2 * np.array([center - width, center + width]))
@@ -472,11 +472,11 @@ def _jackknifed(name: str, value: tuple[float, float], left_out: Sequence[tuple[
     return Statistic(name=name, value=value[0], low=float(low), high=float(high))
 
 
-def _complete(
+def _complete_cohort(
     cohort: Cohort, formulas: Sequence[str | None], columns: Sequence[str], *, drop_missing: bool,
     numbers: Sequence[str] = (),
 ) -> Cohort:  # fmt: skip
-    given = [one for one in formulas if one is not None and one.strip(" ~") != "1"]
+    given = [formula for formula in formulas if formula is not None and formula.strip(" ~") != "1"]
     return complete_cohort(cohort, given, columns, drop_missing=drop_missing, numbers=numbers)
 
 
@@ -489,7 +489,7 @@ def _with_constant(columns: FloatArray) -> FloatArray:
 
 
 def _models(cohort: Cohort, formula: str, null: str | None) -> tuple[Design, FloatArray, tuple[str, ...]]:
-    """Return the design of the full model, the columns (N, q) of the reduced one, and the terms of that."""
+    """Return the design of the full model, the columns (N, q) of the reduced model, and the terms of the latter."""
     design = design_of(formula, cohort.table)
     full, terms = _with_constant(design.matrix), design.terms[:-1]
     if null is None:
@@ -503,12 +503,14 @@ def _models(cohort: Cohort, formula: str, null: str | None) -> tuple[Design, Flo
     if rank >= len(cohort):
         raise InputError(f"{formula!r} has {rank} columns for {len(cohort)} shapes, which leaves no residuals.")
     if np.linalg.norm(reduced - full @ (np.linalg.pinv(full) @ reduced)) > _ALIASED * np.linalg.norm(reduced):
-        raise InputError(f"The null model {null!r} must be nested in {formula!r}; leave out terms that this lacks.")
+        raise InputError(
+            f"The null model {null!r} must be nested in {formula!r}; remove the terms not contained in it."
+        )
     return design, reduced, tuple(term.label for term in terms)
 
 
 def _mean_estimator(design: Design, indicator: FloatArray) -> FloatArray:
-    """Return (G, N) that gives least-squares means of groups (N, G), with numbers at their mean (M30)."""
+    """Return the (G, N) estimator of least-squares means of groups (N, G), with numbers at their mean (M30)."""
     n = len(indicator)
     values = {v.column: design.values[v.column] if v.levels else [v.middle] * n for v in design.variables}
     rows = indicator.T @ _with_constant(design.rows(values)) / indicator.sum(axis=0)[:, None]
@@ -521,11 +523,11 @@ def _lines(indicator: FloatArray, x: FloatArray, covariate: str) -> FloatArray:
     if (np.linalg.norm(less(lines[:, len(indicator.T) :], indicator), axis=0) <= _ALIASED * np.linalg.norm(x)).any():
         if indicator.shape[1] == 1:
             raise InputError(f"{covariate!r} is the same for all shapes, which have no slope; choose another column.")
-        raise InputError(f"{covariate!r} is constant within a group, which has no slope; leave the group out.")
+        raise InputError(f"{covariate!r} is constant within a group, which has no slope; exclude the group.")
     return lines
 
 
-def _permuted(
+def _permute_estimates(
     estimator: FloatArray, reduced: FloatArray, cohort: Cohort, residuals: Residuals, permutations: int, seed: int,
     progress: Progress | None,
 ) -> Iterator[FloatArray]:  # fmt: skip
@@ -552,25 +554,29 @@ def _pairs_result(
     """Return the result of statistics of pairs of groups, from batches (statistics, pairs, b) of permutations.
 
     Angles are between `directions` (G, K); their arrangements are of another statistic unless residuals are raw. Their
-    p is not known for raw residuals, nor if no vector of the pair `is_long` (G,), that is longer than its noise.
+    p is not known for raw residuals, nor if no vector of the pair is longer than its noise, `is_long` (G,).
     """
     values = np.concatenate(batches, axis=2)
     statistics = [
-        one for name_of_one, own in zip(names, values, strict=False)
-        for one in pair_statistics(name_of_one, own, groups.pair_names)
+        statistic for name_of_statistic, own in zip(names, values, strict=False)
+        for statistic in pair_statistics(name_of_statistic, own, groups.pair_names)
     ]  # fmt: skip
-    for k, one in enumerate(statistics):
-        if one.name.startswith("angle"):
-            pair = list(groups.pairs[groups.pair_names.index(one.tested)])
+    for k, statistic in enumerate(statistics):
+        if statistic.name.startswith("angle"):
+            pair = list(groups.pairs[groups.pair_names.index(statistic.tested)])
             if settings["residuals"] == "raw":
-                statistics[k] = replace(one, p=None, unknown_p="raw residuals")
+                statistics[k] = replace(statistic, p=None, unknown_p="raw residuals")
                 continue
             angle = float(angles_between(*directions[pair][:, None])[0])
-            one = replace(one, value=angle, arrangements=np.zeros(0))
-            statistics[k] = one if is_long[pair].any() else replace(one, p=None, z=None, unknown_p="short vectors")
-    rows = [(one.name, one.tested, one.value,
-             float(np.quantile(one.arrangements, 1 - LEVEL)) if len(one.arrangements) else None, one.z, one.p)
-            for one in statistics]  # fmt: skip
+            statistic = replace(statistic, value=angle, arrangements=np.zeros(0))
+            statistics[k] = (
+                statistic if is_long[pair].any() else replace(statistic, p=None, z=None, unknown_p="short vectors")
+            )
+    rows = [
+        (own.name, own.tested, own.value,
+         float(np.quantile(own.arrangements, 1 - LEVEL)) if len(own.arrangements) else None, own.z, own.p)
+        for own in statistics
+    ]  # fmt: skip
     table = TablePart.of("Pairs of groups", ("statistic", "groups", "value", "95 % limit", "Z", "p"), rows)
     return ShapeTestResult(
         name=name, cohort=cohort, statistics=statistics, settings=settings, classes=classes, tables=(table,),

@@ -35,18 +35,18 @@ class Ordination:
     """Shapes as scores on the axes of an ordination.
 
     Args:
-        method: how the axes were chosen.
-        cohort: the shapes that were used.
+        method: method by which the axes were computed.
+        cohort: cohort of the shapes that were used.
         axes: (A, K) scores are (coefficients - centre) axes^T.
-        shape_axes: (A, K) change of the coefficients per unit of score; equal to `axes` where these are orthonormal.
+        shape_axes: (A, K) change of the coefficients per unit of score; equal to `axes` if these are orthonormal.
         centre: (K,) coefficients of the shape at the origin.
-        scores: (N, A).
+        scores: (N, A) scores of the shapes.
         eigenvalues: (A,) variance of the scores of principal components; variance of the group means of between-group
             components; F of canonical variates; of phylogenetic axes the square of `sdev` of geomorph (M54).
-        groups: of the shapes; None without a variable.
+        groups: groups of the shapes; None without a variable.
         variable: name of that variable.
-        cross_validated: (N, A) scores of each shape on the axes of the others; None without.
-        predicted: (N,) group of each shape by the axes of the others; None without.
+        cross_validated: (N, A) scores of each shape on axes computed without it; None without groups.
+        predicted: (N,) group of each shape by axes computed without it; None without groups.
         components: principal components that canonical variates are combinations of; None if all are used.
         ancestors: (M, A) scores of the internal nodes of a tree; None without.
         edges: (E, 2) parent and child of each branch: shapes from 0, internal nodes from N; None without.
@@ -120,8 +120,8 @@ def ordinate(
             phylogenetically aligned components.
         group: columns whose classes, or combinations of classes, are the groups.
         tree: phylogeny (Newick or Nexus) whose tips are the shapes; drawn into the plot of principal components.
-        components: number of principal components that cva uses (default: all, or where there are too many of them
-            for the shapes, those of 95 % of the variance, at most half of the shapes minus the groups).
+        components: number of principal components that cva uses (default: all, or, if these are too many for the
+            shapes, those of 95 % of the variance, at most half of the shapes minus the groups).
         drop_missing: exclude shapes with missing values in the table (default: an error).
 
     Raises:
@@ -141,17 +141,17 @@ def ordinate(
     if method in ("phylogenetic-pca", "paca") and tree is None:
         raise InputError(f"The method {method} needs a phylogeny; name a Newick or Nexus file with --tree.")
     if components is not None and method != "cva":
-        raise InputError("A number of components applies to the method cva alone; leave out --components.")
+        raise InputError("A number of components applies to the method cva alone; remove --components.")
     groups = Groups.of(cohort, group, least=2 if needs_groups else 1, why=method) if group else None
     make: _Make = partial(Ordination, method=method, cohort=cohort, groups=groups, variable=" × ".join(group))
     if tree is not None:
         if needs_groups:
-            raise InputError(f"A phylogeny is not drawn into {method}; leave out --tree, or take the method pca.")
-        return _phylogenetic(cohort, tree, method, make)
+            raise InputError(f"A phylogeny is not drawn into {method}; remove --tree, or take the method pca.")
+        return _phylogenetic_axes(cohort, tree, method, make)
     if method == "between-groups" and groups is not None:
         return _between_groups(cohort.coefficients, groups, make)
     if method == "cva" and groups is not None:
-        return _canonical(cohort.coefficients, groups, components, make)
+        return _canonical_variates(cohort.coefficients, groups, components, make)
     centre, axes, values = principal_components(cohort.coefficients)
     scores = (cohort.coefficients - centre) @ axes.T
     return make(axes=axes, shape_axes=axes, centre=centre, scores=scores, eigenvalues=values)
@@ -171,7 +171,7 @@ def principal_components(coefficients: FloatArray) -> tuple[FloatArray, FloatArr
     known = s > RANK * max(s[0], np.finfo(np.float64).tiny)
     if not known.any():
         raise InputError("All shapes are equal, so there are no principal components; check the data.")
-    return centre, _signed(u[:, known] * s[known], vt[known]), s[known] ** 2 / (len(coefficients) - 1)
+    return centre, _orient_axes(u[:, known] * s[known], vt[known]), s[known] ** 2 / (len(coefficients) - 1)
 
 
 def _between_groups(coefficients: FloatArray, groups: Groups, make: _Make) -> Ordination:
@@ -180,10 +180,10 @@ def _between_groups(coefficients: FloatArray, groups: Groups, make: _Make) -> Or
     known = squares > RANK**2 * float(((coefficients - centre) ** 2).sum())
     if not known.any():
         raise InputError("The means of the groups are equal, so there are no between-group components.")
-    axes = _signed((coefficients - centre) @ axes[known].T, axes[known])
+    axes = _orient_axes((coefficients - centre) @ axes[known].T, axes[known])
     validated, predicted = np.empty((len(coefficients), len(axes))), np.empty(len(coefficients), dtype=np.int32)
     for k, (shape, code) in enumerate(zip(coefficients, groups.codes, strict=True)):
-        others, sizes = _without(means, counts, shape, int(code))
+        others, sizes = _group_means_without(means, counts, shape, int(code))
         # M15
         middle, own, _ = _between_axes(others, sizes)
         validated[k] = (shape - middle) @ own.T @ _rotation(own @ axes.T)
@@ -198,10 +198,10 @@ def discriminant_components(coefficients: FloatArray, groups: Groups, components
     """Return the number of principal components of shapes (N, K) that linear discriminants of groups can use.
 
     Args:
-        coefficients: of the shapes.
-        groups: of the shapes, two or more in each.
-        components: the number asked for; None for all, or where the covariance within groups would be singular, for
-            those of 95 % of the variance, at most half of N - G.
+        coefficients: (N, K) coefficients of the shapes.
+        groups: groups of the shapes, two or more shapes in each.
+        components: requested number; None for all, or, if the covariance within groups would be singular, for those of
+            95 % of the variance, at most half of N - G.
 
     Raises:
         InputError: more components than the shapes have, or than N - G - 1, which leave-one-out needs.
@@ -219,7 +219,7 @@ def discriminant_components(coefficients: FloatArray, groups: Groups, components
     return components
 
 
-def _canonical(coefficients: FloatArray, groups: Groups, components: int | None, make: _Make) -> Ordination:
+def _canonical_variates(coefficients: FloatArray, groups: Groups, components: int | None, make: _Make) -> Ordination:
     n, n_groups, counts = len(coefficients), len(groups.names), groups.counts
     used = discriminant_components(coefficients, groups, components)
     centre, all_axes, _ = principal_components(coefficients)
@@ -235,10 +235,10 @@ def _canonical(coefficients: FloatArray, groups: Groups, components: int | None,
     whitened = values @ (vt.T / s)
     means = means_of(whitened, groups.codes)
     _, rotation, squares = _between_axes(means, counts)
-    rotation = _signed(whitened @ rotation.T, rotation)
+    rotation = _orient_axes(whitened @ rotation.T, rotation)
     validated, predicted = np.empty((n, len(rotation))), np.empty(n, dtype=np.int32)
     for k, (shape, code) in enumerate(zip(whitened, groups.codes, strict=True)):
-        others, sizes = _without(means, counts, shape, int(code))
+        others, sizes = _group_means_without(means, counts, shape, int(code))
         # M17: without this shape, the covariance within groups changes by a matrix of rank one.
         away = shape - means[code]
         lost = away @ away * counts[code] / (sizes[code] * (n - n_groups))
@@ -258,7 +258,7 @@ def _canonical(coefficients: FloatArray, groups: Groups, components: int | None,
     )  # fmt: skip
 
 
-def _phylogenetic(cohort: Cohort, tree: Tree | Path, method: str, make: _Make) -> Ordination:
+def _phylogenetic_axes(cohort: Cohort, tree: Tree | Path, method: str, make: _Make) -> Ordination:
     """Return axes of species as `gm.prcomp` of geomorph, with their ancestors."""
     tree = (tree if isinstance(tree, Tree) else read_tree(tree)).matched(cohort.names)
     is_phylogenetic, values = method == "phylogenetic-pca", cohort.coefficients
@@ -282,7 +282,7 @@ def _between_axes(means: FloatArray, counts: Orders) -> tuple[FloatArray, FloatA
     return centre, vt[: len(counts) - 1], s[: len(counts) - 1] ** 2
 
 
-def _without(means: FloatArray, counts: Orders, shape: FloatArray, code: int) -> tuple[FloatArray, Orders]:
+def _group_means_without(means: FloatArray, counts: Orders, shape: FloatArray, code: int) -> tuple[FloatArray, Orders]:
     """Return the means (G, K) and counts (G,) of groups without a shape (K,) of the group `code`."""
     others, sizes = means.copy(), counts.copy()
     sizes[code] -= 1
@@ -290,7 +290,7 @@ def _without(means: FloatArray, counts: Orders, shape: FloatArray, code: int) ->
     return others, sizes
 
 
-def _signed(scores: FloatArray, axes: FloatArray) -> FloatArray:
+def _orient_axes(scores: FloatArray, axes: FloatArray) -> FloatArray:
     """Return axes (A, K) whose score (N, A) of largest magnitude is positive."""
     largest = scores[np.abs(scores).argmax(axis=0), np.arange(len(axes))]
     return np.where(largest < 0, -1.0, 1.0)[:, None] * axes

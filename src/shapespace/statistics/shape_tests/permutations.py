@@ -47,7 +47,7 @@ def permuted(
     n: int, permutations: int, seed: int, statistic: Callable[[Orders], FloatArray],
     progress: Progress | None,
 ) -> FloatArray:  # fmt: skip
-    """Return the (P, ...) statistics of all `orders`, of which `statistic` takes a batch."""
+    """Return the (P, ...) statistics of all `orders`; `statistic` is called with batches of orders."""
     step, batches = StepCounter(permutations, progress), list[FloatArray]()
     for _, rows in orders(n, permutations, seed):
         batches.append(statistic(rows))
@@ -60,8 +60,8 @@ class Groups:
     """Groups of the shapes of a cohort.
 
     Args:
-        names: of the groups, in alphabetical order.
-        codes: (N,) the group of each shape.
+        names: names of the groups, in alphabetical order.
+        codes: (N,) number of the group of each shape.
     """
 
     names: tuple[str, ...]
@@ -88,11 +88,11 @@ class Groups:
         return [f"{self.names[a]} – {self.names[b]}" for a, b in self.pairs]
 
     def labels(self, rows: Orders) -> FloatArray:
-        """Return (b, G, N) 1 where a shape is of a group, of which orders (b, N) permute the members."""
+        """Return (b, G, N) labels, 1 for the members of each group, permuted by orders (b, N)."""
         return (self.codes[rows][:, None, :] == np.arange(len(self.names))[:, None]).astype(np.float64)
 
     def sums(self, values: FloatArray, rows: Orders) -> FloatArray:
-        """Return the (b, G, K) sums of values (N, K) in each group, of which orders (b, N) permute the members."""
+        """Return the (b, G, K) sums of values (N, K) in each group, with members permuted by orders (b, N)."""
         return (self.labels(rows).reshape(-1, len(values)) @ values).reshape(len(rows), len(self.names), -1)
 
     def residuals(self, values: FloatArray) -> FloatArray:
@@ -101,7 +101,7 @@ class Groups:
         return (values - means_of(values, self.codes)[self.codes]) * np.sqrt(counts / (counts - 1))
 
     def resamples(self, draws: int, seed: int) -> FloatArray:
-        """Return how often each shape is drawn (draws, N) in bootstrap samples of each group; in the first, once."""
+        """Return how often each shape is drawn (draws, N) in bootstrap samples of each group; first, each once."""
         rng = np.random.default_rng([seed, _STREAM, _RESAMPLES])
         counts = np.ones((draws, len(self.codes)))
         for g, n in enumerate(self.counts.tolist()):
@@ -113,10 +113,10 @@ class Groups:
         """Return the groups by the classes of one column, or of several combined as `a.b`.
 
         Args:
-            cohort: with a table in which nothing of these columns is missing.
-            columns: of the table.
+            cohort: cohort with a table without missing values in these columns.
+            columns: columns of the table.
             least: smallest number of shapes of a group.
-            why: what needs that many, for the message.
+            why: analysis that needs that many, for the message.
 
         Raises:
             InputError: no such column, fewer than two groups, or a group with too few shapes.

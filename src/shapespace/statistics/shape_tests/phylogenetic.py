@@ -1,6 +1,6 @@
 """Tests of shapes of species on a phylogeny: signal, and generalised least squares.
 
-The shapes of a cohort are those of the tips, one for each. Equations Mn are those of docs/morphometrics.md.
+The shapes of a cohort are those of the tips, one shape for each tip. Equations Mn are those of docs/morphometrics.md.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from shapespace.io.trees import Tree, read_tree
 from shapespace.schemas import TablePart
 from shapespace.statistics.compare_formula import Term, design_of
 from shapespace.statistics.compare_shapes import CompareConfig, SquaresType, complete_cohort, term_tests
-from shapespace.statistics.compare_strata import Stratum, less, refuse_aliased, refuse_few
+from shapespace.statistics.compare_strata import Stratum, check_error_freedom, check_not_aliased, less
 from shapespace.statistics.methods import REDUCED_OF_EACH_TERM
 from shapespace.statistics.shape_tests.permutations import Orders, permuted
 from shapespace.statistics.shape_tests.shape_test_result import ShapeTestResult, Statistic, pair_statistics
@@ -40,7 +40,7 @@ def inverse_root(covariance: FloatArray) -> FloatArray:
     return (vectors / np.sqrt(values)) @ vectors.T
 
 
-def _on_tree(cohort: Cohort, tree: Tree | Path) -> tuple[Cohort, Tree]:
+def _match_tree(cohort: Cohort, tree: Tree | Path) -> tuple[Cohort, Tree]:
     """Return the cohort with the notes of the tree, and the tree whose tips are its shapes."""
     own = (tree if isinstance(tree, Tree) else read_tree(tree)).matched(cohort.names)
     return replace(cohort, notes=(*cohort.notes, *own.notes)), own
@@ -50,7 +50,7 @@ def ancestral_states(tree: Tree, values: FloatArray) -> FloatArray:
     """Return the maximum-likelihood states (M - T, K) of internal nodes, root first, by Brownian motion (M52).
 
     Args:
-        tree: with T tips.
+        tree: tree with T tips.
         values: (T, K) states of the tips in their order.
     """
     root = least_squares(tree.covariance)[0] @ values
@@ -68,9 +68,9 @@ def estimate_phylogenetic_signal(
         cohort: one shape for each species.
         tree: Newick or Nexus file whose tips have the names of the shapes; other tips are pruned.
         permutations: number of permutations of the shapes over the tips, including the observed data.
-        seed: of the permutations.
+        seed: seed of the permutations.
         drop_missing: has no effect, because no column of the table is used.
-        progress: called with (done, total).
+        progress: function called with (done, total).
 
     Raises:
         InputError: shapes without tip, fewer than three, or tips without a distance between them.
@@ -80,7 +80,7 @@ def estimate_phylogenetic_signal(
         >>> 0 < result.statistics[0].p <= 1
         True
     """
-    cohort, tree = _on_tree(cohort.complete((), drop_missing=drop_missing), tree)
+    cohort, tree = _match_tree(cohort.complete((), drop_missing=drop_missing), tree)
     n = len(cohort)
     u, s, _ = np.linalg.svd(cohort.coefficients - cohort.coefficients.mean(axis=0), full_matrices=False)
     gram, share = (u * s**2) @ u.T, s**2 / (s**2).sum()
@@ -102,7 +102,10 @@ def estimate_phylogenetic_signal(
     with threadpool_limits(1, user_api="blas"):
         k = permuted(n, permutations, seed, ratios, progress)
     by_axis = pair_statistics("K", k.T[1:], [f"principal component {j}" for j in range(1, k.shape[1])])
-    rows = [(one.tested, float(own), one.value, one.z, one.p) for one, own in zip(by_axis, share, strict=False)]
+    rows = [
+        (statistic.tested, float(own), statistic.value, statistic.z, statistic.p)
+        for statistic, own in zip(by_axis, share, strict=False)
+    ]
     table = TablePart.of("Phylogenetic signal of principal components", ("component", "variance", "K", "Z", "p"), rows,
                          percent=("variance",))  # fmt: skip
     return ShapeTestResult(
@@ -125,9 +128,9 @@ def fit_pgls(
         anova_type: type of the sums of squares: `I`, each term after those before it; `II`, each term after all terms
             that do not contain it; `III`, each term after all others.
         permutations: number of permutations of residuals, including the observed data.
-        seed: of the permutations.
+        seed: seed of the permutations.
         drop_missing: exclude shapes with missing values in the table (default: an error).
-        progress: called with (done, total).
+        progress: function called with (done, total).
 
     Raises:
         InputError: a formula that cannot be read, terms that follow from others, missing values, shapes without tip,
@@ -139,14 +142,14 @@ def fit_pgls(
         True
     """
     config = CompareConfig(anova_type=anova_type, permutations=permutations, seed=seed, maps=False)
-    cohort, tree = _on_tree(complete_cohort(cohort, [formula], [], drop_missing=drop_missing), tree)
+    cohort, tree = _match_tree(complete_cohort(cohort, [formula], [], drop_missing=drop_missing), tree)
     design = design_of(formula, cohort.table)
     n, p = len(cohort), len(design.matrix[0])
-    refuse_few(n - 1, design, "", n, "shapes", p)
+    check_error_freedom(n - 1, design, "", n, "shapes", p)
     transformation = inverse_root(tree.covariance)  # M55
     constant, columns = transformation.sum(axis=1)[:, None], np.arange(p + 1, dtype=np.intp)
     matrix = transformation @ design.matrix
-    refuse_aliased(less(matrix, constant), columns[:p], design.terms, design)
+    check_not_aliased(less(matrix, constant), columns[:p], design.terms, design)
     stratum = Stratum(
         name="", shapes=less(transformation @ cohort.coefficients, constant), matrix=np.hstack([matrix, constant]),
         columns=columns, terms=design.terms, groups=np.zeros(n, dtype=np.intp), removed=0, number=0,
@@ -155,13 +158,13 @@ def fit_pgls(
     tests = list(term_tests(stratum, config, StepCounter(len(design.terms), progress).add))
     residual = less(stratum.shapes, stratum.matrix)
     total, left = (float((rows**2).sum()) for rows in (stratum.shapes, residual))
-    rows = [*((one.term, one.df, one.squares, one.r2, one.f, one.z, one.p) for one in tests),
+    rows = [*((test.term, test.df, test.squares, test.r2, test.f, test.z, test.p) for test in tests),
             ("residuals", stratum.df_error, left, left / total, None, None, None),
             ("total", n - 1, total, None, None, None, None)]  # fmt: skip
     table = TablePart.of("Phylogenetic analysis of variance", ("term", "df", "SS", "R²", "F", "Z", "p"), rows)
     return ShapeTestResult(
         name="pgls", cohort=cohort, tables=(table,),
-        statistics=[Statistic.of("F", one.arrangements, one.term) for one in tests],
+        statistics=[Statistic.of("F", test.arrangements, test.term) for test in tests],
         settings={"formula": formula, "tree": tree.where, "anova_type": anova_type, "permutations": permutations,
                   "seed": seed},
         reduced_model=REDUCED_OF_EACH_TERM,

@@ -51,9 +51,9 @@ def plan_sample_size(
         sizes: numbers of shapes in each group.
         simulations: number of simulated studies for each size.
         permutations: number of permutations in the test of each, including the simulated data.
-        seed: of the simulations.
+        seed: seed of the simulations.
         drop_missing: exclude shapes with missing values in the table (default: an error).
-        progress: called with (done, total).
+        progress: function called with (done, total).
 
     Raises:
         InputError: no such column, a group of fewer than three shapes, sizes below 2, an effect that cannot be read or
@@ -94,7 +94,7 @@ def plan_sample_size(
         powers.append(
             Statistic(name="power", tested=f"{size} per group", value=found / simulations, low=low, high=high)
         )
-    counts, values = tuple(map(float, sorted(set(sizes)))), tuple(one.value for one in powers)
+    counts, values = tuple(map(float, sorted(set(sizes)))), tuple(power.value for power in powers)
     smallest = _smallest_size(counts, values)
     note = (
         f"The means of the pilot have a distance of {observed:.3g}, which is biased upwards by sampling; without this "
@@ -104,7 +104,7 @@ def plan_sample_size(
     )  # fmt: skip
     if smallest is not None:
         powers.append(Statistic(name="shapes per group", tested="power of 80 %", value=float(smallest)))
-    limits = [(one.low, one.high) for one in powers[: len(counts)]]
+    limits = [(power.low, power.high) for power in powers[: len(counts)]]
     curve = Series(x=counts, y=values, low=tuple(low for low, _ in limits), high=tuple(high for _, high in limits))
     shares = ("power", "lower 95 %", "upper 95 %")
     rows = [(int(count), value, *limit) for count, value, limit in zip(counts, values, limits, strict=True)]
@@ -167,7 +167,7 @@ def _simulator(
 
 
 def _smallest_size(sizes: tuple[float, ...], powers: tuple[float, ...]) -> int | None:
-    """Return the size for the power that is planned for; None where it is outside the sizes."""
+    """Return the size for the planned power; None if it is outside the sizes."""
     if not powers[0] < _POWER <= max(powers):
         return None
     # The probit of the power is nearly linear in the root of the size.

@@ -24,14 +24,14 @@ class Statistic:
     """A statistic with its permutation distribution.
 
     Args:
-        name: such as `CR`, or `difference of disparity`.
-        tested: what it compares, such as `female – male`; empty where the name says it.
-        value: as observed.
-        p: share of the arrangements that are as extreme; None without a test, or where it is not known.
+        name: name of the statistic, such as `CR`, or `difference of disparity`.
+        tested: compared groups or variables, such as `female – male`; empty if the name states them.
+        value: observed value.
+        p: share of the arrangements that are as extreme; None without a test, or if it is not known.
         z: effect size, the value in standard deviations of its arrangements; None without.
         low, high: confidence interval; None without.
         arrangements: (P,) the statistic of each arrangement, the observed one first; empty without a test.
-        unknown_p: why p is not known; None where it is, or without a test.
+        unknown_p: reason why p is not known; None if it is known, or without a test.
 
     Example:
         >>> statistic = ss.statistics.compare_disparity(cohort, group=["group"], permutations=99).statistics[0]
@@ -53,7 +53,7 @@ class Statistic:
 
     @property
     def label(self) -> str:
-        """Name and what is compared."""
+        """Name of the statistic and the compared groups."""
         return f"{self.name}, {self.tested}" if self.tested else self.name
 
     @staticmethod
@@ -68,9 +68,9 @@ class Statistic:
         """Return a statistic with p and Z of its arrangements.
 
         Args:
-            name: of the statistic.
-            arrangements: (P,) the observed one first.
-            tested: what it compares.
+            name: name of the statistic.
+            arrangements: (P,) statistic of each arrangement, the observed one first.
+            tested: compared groups or variables.
             tail: whether large or small values are extreme.
             z: transformation before Z is standardised; `standard` for none, `none` for no Z.
         """
@@ -91,18 +91,19 @@ class ShapeTestResult(AnalysisResult):
     """Result of one of `SHAPE_TESTS`.
 
     Args:
-        name: of the test in the table of tests.
-        cohort: the shapes that were used.
-        statistics: the most important ones first.
+        name: name of the test in the table of tests.
+        cohort: cohort of the shapes that were used.
+        statistics: statistics, the most important ones first.
         tables: further tables of the report; each is also written as CSV, under its title.
         figures: further parts of the report, after the tables.
         arrays: file name (.npz) -> arrays by name, which figures refer to.
-        settings: all that the result depends on, the seed among it.
+        settings: settings that determine the result, the seed among them.
         classes: columns whose classes are counted in the sample sizes.
-        reduced_model: terms of the model whose residuals are permuted; None where shapes or labels themselves are.
+        reduced_model: terms of the model whose residuals are permuted; None if shapes or labels themselves are
+            permuted.
         assumptions: sentences on assumptions of the test, for the methods.
-        level: of significance.
-        subject: column of the independent units; None where all shapes are independent.
+        level: level of significance.
+        subject: column of the independent units; None if all shapes are independent.
 
     Example:
         >>> result = ss.statistics.compare_disparity(cohort, group=["group"], permutations=99)
@@ -131,32 +132,36 @@ class ShapeTestResult(AnalysisResult):
         return shape_test(self.name)
 
     def statistic(self, name: str, tested: str = "") -> Statistic:
-        """Return a statistic by its name and what it compares.
+        """Return a statistic by its name and the compared groups.
 
         Raises:
-            KeyError: there is none.
+            KeyError: there is no such statistic.
         """
-        for one in self.statistics:
-            if one.name == name and (not tested or one.tested == tested):
-                return one
+        for statistic in self.statistics:
+            if statistic.name == name and (not tested or statistic.tested == tested):
+                return statistic
         raise KeyError(f"{name} {tested}".strip())
 
     def table(self, title: str) -> TablePart:
         """Return a table by its title.
 
         Raises:
-            KeyError: there is none.
+            KeyError: there is no such table.
         """
-        for one in self.tables:
-            if one.title == title:
-                return one
+        for table in self.tables:
+            if table.title == title:
+                return table
         raise KeyError(title)
 
     @property
     def methods(self) -> Methods:
         """Sample sizes, tests and assumptions."""
-        tested = tuple(dict.fromkeys(one.name for one in self.statistics if one.p is not None or one.unknown_p))
-        counts = [len(one.arrangements) for one in self.statistics if len(one.arrangements)]
+        tested = tuple(
+            dict.fromkeys(
+                statistic.name for statistic in self.statistics if statistic.p is not None or statistic.unknown_p
+            )
+        )
+        counts = [len(statistic.arrangements) for statistic in self.statistics if len(statistic.arrangements)]
         scheme = TestScheme(
             tested=tested, statistic=self.test.statistics, resampling=self.test.resampling, unit=self.test.permuted,
             reduced_model=self.reduced_model, arrangements=max(counts, default=0),
@@ -166,12 +171,12 @@ class ShapeTestResult(AnalysisResult):
         return methods_of(
             self.cohort, len(set(subjects)), level=self.level, sizes=sizes,
             tests=(scheme,) if tested else (), assumptions=self.assumptions,
-            effect_size="box-cox" if any(one.z is not None for one in self.statistics) else "",
+            effect_size="box-cox" if any(statistic.z is not None for statistic in self.statistics) else "",
         )  # fmt: skip
 
     def __repr__(self) -> str:
-        rows = [f"{one.label} {one.value:.4g}" + (f", p {one.p:.3g}" if one.p is not None else
-                ", p not known" if one.unknown_p else "") for one in self.statistics]  # fmt: skip
+        rows = [f"{statistic.label} {statistic.value:.4g}" + (f", p {statistic.p:.3g}" if statistic.p is not None else
+                ", p not known" if statistic.unknown_p else "") for statistic in self.statistics]  # fmt: skip
         return f"<ShapeTestResult {self.name} of {len(self.cohort)} shapes; {list_briefly(rows)}>"
 
 
@@ -179,4 +184,4 @@ def pair_statistics(
     name: str, values: FloatArray, pairs: Sequence[str], tail: Literal["upper", "lower"] = "upper"
 ) -> list[Statistic]:
     """Return the statistics of pairs from their arrangements (pairs, P)."""
-    return [Statistic.of(name, one, pair, tail=tail) for one, pair in zip(values, pairs, strict=True)]
+    return [Statistic.of(name, own, pair, tail=tail) for own, pair in zip(values, pairs, strict=True)]

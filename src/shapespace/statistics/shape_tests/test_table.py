@@ -16,11 +16,12 @@ class ShapeTest:
 
     Args:
         name: word after `shapespace test`.
-        summary: what it does, without a capital and a full stop.
-        function: in `statistics.shape_tests`, with its module; it takes a cohort and the options by name.
-        statistics: what is computed, in words.
-        permuted: what is permuted, as `TestScheme.unit`.
-        resampling: how p values are computed.
+        summary: description of the test, without a capital and a full stop.
+        function: name of the function in `statistics.shape_tests`, with its module; it takes a cohort and the options
+            by name.
+        statistics: computed statistics, in words.
+        permuted: permuted unit, as `TestScheme.unit`.
+        resampling: method by which p values are computed.
         references: citations of the method.
         example: a command line.
         options: field of the function -> name of its value in the help; empty for a flag or a choice.
