@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from shapespace.fit.diagnostics.reasons import Reason, ReasonCode
-from shapespace.fit.method import Ended, Method
+from shapespace.fit.method import FitOutcome, Method
 from shapespace.fit.result import Status
 
 _FARTHEST_Z = 10.0
@@ -18,7 +18,7 @@ _DENSE_MOVED_SHARE = 0.009
 those that move further, most lie elsewhere than they belong (docs/dense.md)."""
 
 
-def judge(method: Method, ended: Ended) -> tuple[Status, tuple[Reason, ...]]:
+def judge(method: Method, ended: FitOutcome) -> tuple[Status, tuple[Reason, ...]]:
     """Return status and reasons of a fit: contradictions in what is returned, then the doubts of the method."""
     doubts = [*find_contradictions(ended), *method.doubts(ended)]
     if doubts:
@@ -30,7 +30,7 @@ def judge(method: Method, ended: Ended) -> tuple[Status, tuple[Reason, ...]]:
     return "converged", (method.reason(ended),)
 
 
-def find_contradictions(ended: Ended) -> list[Reason]:
+def find_contradictions(ended: FitOutcome) -> list[Reason]:
     """Return how pose, coefficients and surface contradict each other; empty where they agree."""
     from shapespace.fit.robust.posterior import variance_of_new_shapes  # compiled, and loads SciPy
 
