@@ -12,9 +12,9 @@ PoseRange: TypeAlias = Literal["search", "near", "as-given"]
 SIZE = 100.0
 """The template's RMS size in its own frame: all lengths of the method are in hundredths of an object's size."""
 LARGEST_ROTATION_DEG: Mapping[PoseRange, float] = {"near": 60.0, "as-given": 30.0}
-"""Rotation by which the pose of a scan may differ from the frame of its file."""
+"""Largest rotation, degrees, of the pose of a scan from the frame of its file."""
 FEWEST = 2
-"""Scans in a correspondence, and scans that must observe a vertex for it to be estimated where it is missing."""
+"""Smallest number of scans in a correspondence, and of scans that observe a vertex for its estimation elsewhere."""
 
 
 @dataclass(frozen=True, kw_only=True)
