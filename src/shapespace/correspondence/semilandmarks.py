@@ -202,10 +202,10 @@ class _MeanSurface:
             spread = samples[:: max(1, len(samples) // point_set.points)][: point_set.points]
             path = np.concatenate([_spread_points(samples, np.ones(len(samples)), spread, _MEAN_STEPS), samples])
         names = tuple(dict.fromkeys(chain))
-        point_set = np.stack([self._landmarks[name] for name in names])
-        near = self._engine.query(np.concatenate([point_set, path]))
+        positions = np.stack([self._landmarks[name] for name in names])
+        near = self._engine.query(np.concatenate([positions, path]))
         assert near.triangle is not None and near.barycentric is not None
-        closeness = 1.0 / (((near.points[:, None] - point_set) ** 2).sum(axis=2) + (1e-6 * self._edge) ** 2)
+        closeness = 1.0 / (((near.points[:, None] - positions) ** 2).sum(axis=2) + (1e-6 * self._edge) ** 2)
         corners = faces_of(self.mesh)[near.triangle]
         return _Plan(
             point_set, names, corners, near.barycentric, near.triangle, closeness / closeness.sum(1, keepdims=True)
