@@ -29,7 +29,7 @@ class ShapePredictor:
     """Probabilistic PCA (Tipping and Bishop 1999) of some shapes, which predicts other ones (C13).
 
     Args:
-        mean: (V, 3).
+        mean: (V, 3) mean shape.
         modes: (3V, K) orthonormal.
         squares: (K,) sum of squares along each mode.
         noise: noise of a coordinate, as a sum of squares like `squares`.

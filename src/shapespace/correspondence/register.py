@@ -132,7 +132,7 @@ class _Samples:
     """Points of one surface that are matched with the other one, in the template's frame.
 
     Args:
-        points: (M, 3) mm.
+        points: (M, 3) positions, mm.
         normals: (M, 3) normals, zero if the surface has no triangles.
         on_border: (M,) whether the points are on the border of the surface.
         colours: (M, 3) colours as lengths in mm; (M, 0) if the surface or the other one has no colours.

@@ -33,7 +33,7 @@ class CorrespondConfig:
         fewest_covered: smallest share of a scan that the template must cover.
         outlier_threshold: scans whose distance from their prediction by the largest group of similar scans is beyond
             this many times the median of that group are excluded as other objects.
-        mirror: what is done with scans that are mirror images of the majority, such as left among right teeth: they are
+        mirror: treatment of scans that are mirror images of the majority, such as left among right teeth: they are
             reflected (auto), excluded (ask), or the files are trusted (never).
         pose: rotation of the scans: found by a search over all rotations (search), or that of the frames of the files,
             refined by at most 30 degrees (as-given) or 60 degrees (near). Position and size are always found. A scan

@@ -234,7 +234,7 @@ class AdditiveModel:
         Args:
             z: (K,) coefficients, in standard deviations: `FitResult.z`.
             z_covariance: (K, K) covariance of z after the fit: `FitResult.z_covariance`. The diagonal alone is not
-                enough, since the sum of identity and expression is known far better than each alone.
+                enough, since the coefficients are correlated after the fit.
 
         Raises:
             InputError: arrays of other shapes, or no covariance.

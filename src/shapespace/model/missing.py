@@ -141,7 +141,7 @@ class CompletedShapes:
     """Aligned shapes with their missing vertices at the conditional means, and the uncertainty of these vertices.
 
     Args:
-        shapes: (N, V, 3) mm.
+        shapes: (N, V, 3) aligned and completed shapes, mm.
         observed: (N, V) True for observed vertices.
         fitted: the probabilistic PCA that completed the shapes.
     """

@@ -78,7 +78,7 @@ class PrincipalComponents:
     """The outcome of a PCA of N shapes with D coordinates.
 
     Args:
-        mean: (D,) mm.
+        mean: (D,) mean, mm.
         basis: (D, K) orthonormal columns, in order of falling variance, signs fixed.
         variance: (K,) variances of the coefficients, mm^2, divisor N - 1.
         total_variance: variance of all modes together, kept or not, mm^2.

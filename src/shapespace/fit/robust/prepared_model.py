@@ -106,7 +106,7 @@ class ModelSurface:
 
     Args:
         topology: topology of its triangles.
-        vertices: (V, 3) mm.
+        vertices: (V, 3) vertices, mm.
         normals: (V, 3) unit normals of the vertices.
         modes: (V, 3, K) float32 modes of its deformation; K is 0 if it is moved vertex by vertex.
     """
@@ -134,7 +134,7 @@ class ModelSurface:
         """Find the closest points by walking over the surface from a vertex and a triangle near each.
 
         Args:
-            points: (M, 3) mm.
+            points: (M, 3) query points, mm.
             vertex: (M,) vertex from which each walk starts.
             triangle: (M,) triangle near it; -1 if none is known.
 
@@ -171,8 +171,8 @@ class LinearShape:
 
     Args:
         topology: topology of all surfaces of the shape model.
-        mean: (V, 3) mm.
-        modes: (V, 3, K) float32.
+        mean: (V, 3) vertices of the mean, mm.
+        modes: (V, 3, K) float32 modes.
     """
 
     topology: Topology

@@ -38,7 +38,7 @@ class NearGrid(NamedTuple):
     Args:
         near: (X, Y, Z) int32 index of a point for each cell: the representative of the nearest cell that contains
             points.
-        points: (3, N) mm.
+        points: (3, N) points of the grid, mm.
         origin: (3, 1) lowest corner, mm.
         cell: length of the edges of a cell, mm.
     """
