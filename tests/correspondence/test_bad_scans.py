@@ -300,4 +300,4 @@ def test_a_mean_that_is_too_small_for_its_unit_is_said(tmp_path: Path, capsys: p
     assert main(line) == 0
     assert "mm large, which is unusual for mm; set the unit of the meshes with --unit" in capsys.readouterr().err
     assert main([*line, "--unit", "m"]) == 0
-    assert "odd for mm" not in capsys.readouterr().err
+    assert "unusual for mm" not in capsys.readouterr().err

@@ -155,8 +155,8 @@ class FitConfig:
             or `landmarks:MM`, within this distance in mm of the landmarks; empty for the complete scan.
         region: part of the model to which fit, distances and verdict are restricted: a name of `ShapeModel.regions`, or
             indices of vertices; None for the complete model.
-        strict: whether to reject scans with coordinates that are NaN or infinite (default: remove the triangles that
-            use them, with a note).
+        strict: reject scans with coordinates that are NaN or infinite (default: remove the triangles that use them,
+            with a note).
 
     Raises:
         InputError: a name that does not exist, numbers below one, or a dense stage after a method that has none.

@@ -103,7 +103,7 @@ class CompletionConfig:
         mirror: `combined` also uses the mirror image of the observed side of a symmetric object, weighted by how well
             sides predict each other; `alone` uses the mirror image instead of the model wherever the mirrored side is
             observed.
-        with_doubtful: whether to complete scans whose fit is doubtful too (default: they raise `FitError`).
+        with_doubtful: complete scans whose fit is doubtful too (default: reject them).
         seed: seed of the samples.
         fit: settings of the fit.
 
