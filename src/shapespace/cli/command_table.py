@@ -459,9 +459,9 @@ COMMANDS: tuple[Command, ...] = (
         ),
         (
             "The meshes have the same vertices and triangles. Of a folder that correspond wrote, the surfaces in "
-            "correspondence are used; a folder of an unfinished run is an error. Surfaces whose unit differs from the "
+            "correspondence are used; a folder of an unfinished run is rejected. Surfaces whose unit differs from the "
             "majority are converted to the unit of the majority, which --unit sets; with --gauge form or --no-align "
-            "they are an error. With fewer than four meshes, --modes auto keeps all modes. Modes that result from "
+            "they are rejected. With fewer than four meshes, --modes auto keeps all modes. Modes that result from "
             "alignment or rounding alone are always omitted, and counted.",
         ),
     ),
