@@ -209,7 +209,7 @@ def test_the_other_side_improves_what_the_model_says() -> None:
         completion = complete(model, scan, config, T_scan_model=Similarity.identity())
         errors[mirror] = np.linalg.norm(completion.vertices - truth, axis=1)[truth[:, 0] > 0].mean()
     assert errors["alone"] < errors["never"] and errors["combined"] < errors["never"], errors
-    with pytest.raises(InputError, match="Omit --mirror"):
+    with pytest.raises(InputError, match="omit --mirror"):
         complete(MODEL, cut_scan(np.zeros(5), -0.2)[0], replace(FORM, mirror="combined"))
 
 

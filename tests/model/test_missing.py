@@ -241,7 +241,7 @@ def test_what_cannot_be_used_is_refused_in_one_sentence() -> None:
     meshes = training_meshes(vertices=200)[:4]
     nothing = np.ones((4, 200), dtype=bool)
     nothing[2] = False
-    with pytest.raises(InputError, match=r"blob_2\.ply: all of its vertices are missing. Exclude this mesh"):
+    with pytest.raises(InputError, match=r"blob_2\.ply: all of its vertices are missing; exclude this mesh"):
         ShapeModel.fit(holed(meshes, nothing))
     nothing[2, :3] = True
     with pytest.raises(InputError, match=r"blob_2\.ply"):

@@ -150,7 +150,7 @@ class AdditiveModel:
             if np.isnan(mesh.vertices).any():
                 raise InputError(
                     f"{mesh.name}: vertices are missing, and a model that separates identity and expression needs "
-                    "complete meshes. Omit --additive, or exclude the meshes with holes."
+                    "complete meshes; omit --additive, or exclude the meshes with holes."
                 )
         neutrals, shapes, people, expressive = _neutrals_and_expressions(meshes, subjects, neutral, kin)
         row = np.array([people.index(subjects[i]) for i in expressive])
@@ -389,7 +389,7 @@ def _neutrals_and_expressions(
     expressions = np.stack([meshes[i].vertices for i in expressive])
     if not (np.isfinite(neutrals).all() and np.isfinite(expressions).all()):
         raise InputError(
-            "The training meshes have vertices that are not finite. See shapespace check, and repair or exclude them."
+            "The training meshes have vertices that are not finite; see shapespace check, and repair or exclude them."
         )
     return neutrals, expressions, list(own_neutrals), expressive
 

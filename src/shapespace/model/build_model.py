@@ -150,7 +150,7 @@ def build_model(
     meshes = as_meshes(meshes, "build_model")
     kind = representation_named(config.representation, config.control_points)
     if kind is not Vertices and (config.out_of_core or keep_shapes is not None):
-        raise InputError("Only models of vertices can be built from streamed meshes. Omit --representation.")
+        raise InputError("Only models of vertices can be built from streamed meshes; omit --representation.")
     streaming = ""
     if kind is Vertices and keep_shapes is None:
         streaming = streaming_note(meshes, modes=config.modes, out_of_core=config.out_of_core)
@@ -431,7 +431,7 @@ def _check_finite(values: FloatArray, names: Sequence[str]) -> None:
     finite = np.isfinite(values).all(axis=(1, 2))
     if not finite.all():
         raise InputError(
-            f"{names[int(np.argmin(finite))]} has vertices that are not finite. See shapespace check, and repair or "
+            f"{names[int(np.argmin(finite))]} has vertices that are not finite; see shapespace check, and repair or "
             "exclude this mesh."
         )
 
@@ -470,7 +470,7 @@ def fill_holes(shapes: FloatArray, faces: IntArray | None, names: Sequence[str])
     nowhere = np.flatnonzero(~seen.any(axis=0))
     if len(nowhere):
         raise InputError(
-            f"Vertex {nowhere[0]} is missing in every mesh, so it cannot be estimated. Remove it from all meshes."
+            f"Vertex {nowhere[0]} is missing in every mesh, so it cannot be estimated; remove it from all meshes."
         )
     first = int(seen.sum(axis=1).argmax())
     T_mean_shape = [

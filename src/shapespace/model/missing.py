@@ -74,7 +74,7 @@ class ObservedMeshes:
             return ObservedMeshes(meshes, observed[0])
         for mesh, own in zip(meshes, observed, strict=True):
             if not own.any():
-                raise InputError(f"{mesh.name}: all of its vertices are missing. Exclude this mesh.")
+                raise InputError(f"{mesh.name}: all of its vertices are missing; exclude this mesh.")
         used = observed.sum(axis=0) >= max(min_seen * len(meshes) * (1 - 1e-12), _FEWEST)
         pairs = None if meshes[0].faces is None else pairs_of_triangles(meshes[0].faces, len(used))
         if pairs is not None:
@@ -296,5 +296,5 @@ def pose_on_shared(
         return fit_similarity(shape[shared], mean[shared], with_scale=gauge == "shape")
     except InputError as error:
         raise InputError(
-            f"{name}: too few of its vertices are observed to align it with the other meshes. Exclude this mesh."
+            f"{name}: too few of its vertices are observed to align it with the other meshes; exclude this mesh."
         ) from error

@@ -526,7 +526,7 @@ def _check_meshes(meshes: list[Mesh]) -> list[Mesh]:
     common_faces(meshes)
     for mesh in meshes:
         if np.isinf(mesh.vertices).any():
-            raise InputError(f"{mesh.name}: it has vertices that are infinite. Mark them as missing, or exclude it.")
+            raise InputError(f"{mesh.name}: it has vertices that are infinite; mark them as missing, or exclude it.")
     return meshes
 
 

@@ -374,7 +374,7 @@ class ShapeModel:
             name = shape.name if isinstance(shape, Mesh) else "The shape"
             raise CorrespondenceError(
                 f"{name} has {len(vertices)} vertices but the model has {self.n_vertices}; only shapes in the "
-                "model's vertex order can be projected. Fit this one instead (shapespace fit, or fit_scan)."
+                "model's vertex order can be projected; fit this one instead (shapespace fit, or fit_scan)."
             )
         is_observed: BoolArray = ~np.logical_or.reduce(np.isnan(vertices), axis=1)
         if np.isinf(vertices).any() or is_observed.sum() < _FEWEST_OBSERVED:
@@ -600,7 +600,7 @@ def _check_stddev(stddev: FloatArray, mean_vertices: FloatArray, first_mode: int
         if value < _ROUNDING * norm:
             raise InputError(
                 f"Mode {first_mode + mode + 1} of the model has a standard deviation of {value:.1e} mm, which is less "
-                "than the rounding of its vertices. Omit such modes."
+                "than the rounding of its vertices; omit such modes."
             )
         if value > _WIDEST * norm:
             raise InputError(

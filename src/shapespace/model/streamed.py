@@ -115,7 +115,7 @@ class KeptShapes:
         path = folder / _KEPT
         if not path.is_file():
             raise FileError(
-                f"There are no shapes in {folder}, so none can be added to them. Build the model again with "
+                f"There are no shapes in {folder}, so none can be added to them; build the model again with "
                 "--keep-shapes (keep_shapes), which keeps them there."
             )
         try:
@@ -139,7 +139,7 @@ class KeptShapes:
             )
         except (ValueError, KeyError, TypeError) as error:
             raise FileFormatError(
-                f"{path} is damaged. Build the model again with --keep-shapes (keep_shapes)."
+                f"{path} is damaged; build the model again with --keep-shapes (keep_shapes)."
             ) from error
 
     def save(self) -> None:
@@ -163,7 +163,7 @@ class KeptShapes:
         """
         if sha256_of_file(self.folder / _SHAPES) != self.digest:
             raise FileFormatError(
-                f"{self.folder / _SHAPES} is damaged: it does not match its checksum. Copy it again, or build the "
+                f"{self.folder / _SHAPES} is damaged: it does not match its checksum; copy it again, or build the "
                 "model again with --keep-shapes (keep_shapes)."
             )
 
@@ -517,19 +517,19 @@ def check_extent(vertices: FloatArray, name: str) -> None:
     centred = shape - shape.mean(axis=0)
     extent = np.linalg.eigvalsh(centred.T @ centred)
     if extent[1] <= 1e-9 * extent[2]:
-        raise InputError(f"{name}: its vertices lie on a line or coincide, so it cannot be aligned. Exclude this mesh.")
+        raise InputError(f"{name}: its vertices lie on a line or coincide, so it cannot be aligned; exclude this mesh.")
 
 
 def _check_complete(mesh: Mesh) -> None:
     missing: BoolArray = np.isnan(mesh.vertices)
     if missing.any():
         raise InputError(
-            f"{mesh.name}: vertices are missing, and meshes that are streamed from the disk must be complete. Exclude "
+            f"{mesh.name}: vertices are missing, and meshes that are streamed from the disk must be complete; exclude "
             "it, or build from fewer meshes in memory."
         )
     if not (np.abs(mesh.vertices) < np.finfo(np.float32).max).all():
         raise InputError(
-            f"{mesh.name} has vertices that are not finite. See shapespace check, and repair or exclude this mesh."
+            f"{mesh.name} has vertices that are not finite; see shapespace check, and repair or exclude this mesh."
         )
 
 

@@ -531,7 +531,7 @@ def _describe_missing_parts(model: ShapeModel, fit: FitResult, observed: BoolArr
     if share < _LEAST_OBSERVED:
         raise FitError(
             f"{fit.scan_name}: it shows {100 * share:.1f} % of the model, and {100 * _LEAST_OBSERVED:g} % are needed "
-            "to complete it. Scan more of the object, or use a model of the part that it shows."
+            "to complete it; scan more of the object, or use a model of the part that it shows."
         )
     notes = list[str]()
     if share > _COMPLETE:
@@ -577,7 +577,7 @@ def _remove_part(fit: FitResult, part: str) -> Mesh:
     near = build_engine(surface).query(fit.scan.vertices)
     outside = ~inside[near.vertex]
     if not outside.any():
-        raise FitError(f"{fit.scan_name}: it shows only the region {part!r}. Scan more of the object.")
+        raise FitError(f"{fit.scan_name}: it shows only the region {part!r}; scan more of the object.")
     return part_of(fit.scan, outside)
 
 
@@ -661,7 +661,7 @@ def _mirror(model: ShapeModel) -> tuple[IntArray, FloatArray, FloatArray]:
     if mirror.off_share > SYMMETRIC_SHARE:
         raise InputError(
             f"The mean shape differs from its mirror image by {100 * mirror.off_share:.1f} % of its size, so its sides "
-            "do not predict each other. Omit --mirror."
+            "do not predict each other; omit --mirror."
         )
     return mirror.corners, mirror.weights, mirror.turn
 

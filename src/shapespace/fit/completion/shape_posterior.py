@@ -190,7 +190,7 @@ def shape_posterior(
             covariance = left_out.covariance()
     except LinAlgError as error:
         raise FitError(
-            f"{target.mesh.name}: the scanned part does not determine the pose. Give landmarks (--landmarks)."
+            f"{target.mesh.name}: the scanned part does not determine the pose; give landmarks (--landmarks)."
         ) from error
     # A settled posterior is part of each fit of a partial scan, which does not use the mismatches.
     mismatch_mm, covered_mismatch_mm = np.nan, np.nan
