@@ -91,7 +91,7 @@ def test_a_vertex_that_nobody_has_and_a_shape_of_which_little_is_there_are_refus
     with pytest.raises(InputError, match="Vertex 17 is missing in every mesh"):
         fill_holes(nowhere, faces, ["x"] * len(holed))
     holed[3, 2:] = np.nan
-    with pytest.raises(InputError, match="third: too little of it is there"):
+    with pytest.raises(InputError, match="third: too few of its vertices are observed"):
         fill_holes(holed, faces, ["a", "b", "c", "third", *["d"] * 8])
 
 
