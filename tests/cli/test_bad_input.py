@@ -380,7 +380,7 @@ def test_a_model_has_at_most_the_modes_that_the_meshes_determine(run: Run, world
     for modes in (12, 10**9):
         outcome = build(run, meshes, tmp_path / "m.h5", "--modes", modes)
         assert outcome.code == 0 and "11 modes of" in outcome.out
-        assert f"determine 11 modes, so the model has 11 and not the {modes} asked for." in outcome.err
+        assert f"determine 11 modes, so the model has 11 and not the requested {modes}." in outcome.err
 
 
 def test_equal_training_meshes_are_refused(run: Run, world: World, tmp_path: Path) -> None:

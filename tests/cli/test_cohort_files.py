@@ -127,7 +127,7 @@ def test_a_cohort_that_cannot_be_read_has_no_file(run: Run, home: Path) -> None:
         (("--set", "permutations=20"), "permutations is an option; write --permutations 20"),
         (("--set", "gauge=size"), "gauge is 'size'; choose from form, shape"),
         (("--set", "maps=perhaps"), "maps must be yes or no, not 'perhaps'"),
-        (("--set", "seed=x"), "seed 'x' is not a whole number"),
+        (("--set", "seed=x"), "seed 'x' is not an integer"),
         (("--gauge", "form"), "there is no option --gauge; write --set gauge=VALUE"),
         (("--drop-missing",), "there is no option --drop-missing"),
     ],

@@ -293,7 +293,7 @@ def test_build_keeps_as_many_modes_as_asked(
     assert least <= facts["modes"] <= most
     if options[1] in ("all", "1"):
         # Those that alignment or rounding made are left out, and counted.
-        said = re.search(r"^(\d+) modes? (?:is|are) left out, since alignment", outcome.err, re.MULTILINE)
+        said = re.search(r"^(\d+) modes? (?:is|are) omitted, because alignment", outcome.err, re.MULTILINE)
         assert facts["modes"] + (int(said[1]) if said else 0) == 11
     if "--variance" in options:
         assert facts["variance_held"] >= min(float(options[1]), 0.9999) - 1e-12

@@ -50,7 +50,7 @@ def test_what_cannot_be_completed_has_one_sentence(run: Run, world: World, broke
     for more, words in (
         (("--part", "tail"), "no region 'tail'"),
         (("--samples", "1"), "at least two samples"),
-        (("--mirror", "combined"), "leave --mirror out"),
+        (("--mirror", "combined"), "omit --mirror"),
     ):
         answer = run("complete", world.model, broken / "blob0.ply", "-o", out, *more)
         assert answer.code == 2 and words in answer.sentence()

@@ -164,7 +164,7 @@ def test_odd_scans_are_added_or_excluded_as_in_a_run_and_none_by_the_others(
     assert record(same, "metres")["unit_ratio"] == 0.001 and summary(same)["other_units"] == {"metres": 0.001}
     np.testing.assert_allclose(1e3 * surface(same, "metres"), surface(same, "blob5"), atol=1e-3)
     assert np.linalg.norm(surface(same, "cloud") - surface(same, "blob5"), axis=1).mean() < 2.0
-    assert not any("as is usual" in str(note) for note in (record(same, "cloud")["notes"], outcome.err))
+    assert not any("times the usual distance" in str(note) for note in (record(same, "cloud")["notes"], outcome.err))
     notes = [str(record(same, name)["notes"]) for name in ("blob5", "copy")]
     assert any("again; leave one of them out" in note for note in notes)
     assert add(run, alone, odd / "blob5.ply").code == 0

@@ -76,7 +76,7 @@ def test_after_an_interrupt_in_round_two_only_the_rest_is_done(
         stopped.setattr(rounds, "_write", after(SCANS + 1, rounds._write, KeyboardInterrupt()))
         outcome = run("correspond", raw, "-o", tmp_path / "same", *QUICK)
     assert outcome.code == 130
-    assert "the files written so far are whole; the same command goes on from there" in outcome.err
+    assert "the files written so far are complete; the same command continues from there" in outcome.err
     assert no_temporary_files(tmp_path)
     assert run("build", tmp_path / "same", "-o", tmp_path / "model.h5").code == 2
     done = counted(monkeypatch)

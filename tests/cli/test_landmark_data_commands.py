@@ -196,7 +196,7 @@ def test_bad_input_ends_with_one_sentence(run: Run, table: Path, tmp_path: Path)
         (("landmarks", "plot", table, "-o", tmp_path / "a.jpg"), "cannot be written as 'jpg'"),
         (("landmarks", "plot", table, "-o", tmp_path / "a.svg", "--links", tmp_path / "bad.csv"), "the row '2, 99'"),
         (("landmarks", "plot", tmp_path / "one.tps", "-o", tmp_path / "a.svg"), "two or more"),
-        (("export", table, "n1", "--to", "tps"), "leave out names"),
+        (("export", table, "n1", "--to", "tps"), "omit names"),
         (("export", table, "--formula", "~ sex"), "give --to geomorph too"),
         (("export", table, "--to", "tps", "--formula", "~ sex"), "give --to geomorph too"),
         (("export", table, "--to", "geomorph", "--formula", "~ age", "-o", tmp_path / "r"), "age"),

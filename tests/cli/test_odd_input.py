@@ -201,8 +201,8 @@ def test_ctrl_c_ends_with_130_and_whole_files(
     }
     outcome = run(*arguments[command])
     assert outcome.code == 130
-    goes_on = "; the same command goes on from there" if command == "fit" else ""
-    assert outcome.err.splitlines()[-1] == f"shapespace: stopped; the files written so far are whole{goes_on}."
+    goes_on = "; the same command continues from there" if command == "fit" else ""
+    assert outcome.err.splitlines()[-1] == f"shapespace: stopped; the files written so far are complete{goes_on}."
     assert leftovers(tmp_path) == []
     if command == "fit":
         assert {path.name for path in tmp_path.iterdir()} == {

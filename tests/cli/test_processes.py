@@ -22,7 +22,7 @@ from shapespace.io.meshes.mesh_io import read_mesh
 
 COMMAND = [sys.executable, "-m", "shapespace"]
 # Buffered output, as users have it, meets a full disk only when it is flushed.
-STOPPED = "shapespace: stopped; the files written so far are whole; the same command goes on from there."
+STOPPED = "shapespace: stopped; the files written so far are complete; the same command continues from there."
 BUFFERED = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}
 
 
@@ -159,7 +159,7 @@ def test_ctrl_c_that_compiled_code_turns_into_another_error_is_ctrl_c_still(
     parsed = argparse.Namespace(run=turned)
     monkeypatch.setattr("shapespace.cli.parser", lambda: types.SimpleNamespace(parse_args=lambda _: parsed))
     assert main([]) == 130
-    assert capsys.readouterr().err == "shapespace: stopped; the files written so far are whole.\n"
+    assert capsys.readouterr().err == "shapespace: stopped; the files written so far are complete.\n"
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for one process")

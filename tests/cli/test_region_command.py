@@ -67,7 +67,7 @@ def test_what_cannot_be_a_region_or_a_crop_is_one_sentence(run: Run, world: Worl
     assert outcome.code == 2 and "no region 'nose'" in outcome.err and "--region NAME=FILE" in outcome.err
     assert "There is no crop" in run(*fit, "--crop", "ball:1").sentence()
     assert run(*fit, "--crop", "sphere:9999,0,0,1").code == 2
-    assert "leave out dense" in run(*fit, "--region", "nose", "--dense").sentence()
+    assert "omit dense" in run(*fit, "--region", "nose", "--dense").sentence()
     assert run("build", world.meshes, "-o", tmp_path / "m.h5", "--region", "front").code == 2
     assert run("build", world.meshes, "-o", tmp_path / "m.h5", "--region", "front=gone.csv").code == 2
     (tmp_path / "far.csv").write_text("99999\n")

@@ -52,7 +52,7 @@ def test_notes_on_meshes_are_those_of_the_command(tmp_path: Path, capsys: pytest
     said = capsys.readouterr().err
     for beginning in (
         "24 of 1200 vertices are missing (2.0 %), in 4 of 6 meshes.",
-        "1 vertex is taken out of the model, since fewer than 50 % of the meshes show them",
+        "1 vertex is removed from the model, since fewer than 50 % of the meshes show them",
         "The mean is ",
     ):
         [sentence] = [note for note in notes if note.startswith(beginning)]

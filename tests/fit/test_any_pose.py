@@ -181,7 +181,7 @@ def test_directions_of_a_cloud_without_triangles_are_across_it() -> None:
 def test_thinning_leaves_one_point_in_each_cell_that_has_any_and_no_lone_point_far_outside() -> None:
     points = np.random.default_rng(1).uniform(0, 50, (3000, 3))
     points[7] = 1e6
-    kept = any_pose._evenly(points, 9.0, 100.0)  # pyright: ignore[reportPrivateUsage]
+    kept = any_pose._thin_evenly(points, 9.0, 100.0)  # pyright: ignore[reportPrivateUsage]
     cells = np.rint((points - np.delete(points, 7, axis=0).min(axis=0)) / 9.0).astype(int)
     assert 7 not in kept
     assert (np.diff(kept) > 0).all()
@@ -198,5 +198,5 @@ def test_a_sparse_scan_is_no_part_and_a_part_is_one_however_dense(points: int, s
     scan = np.asarray(model.mean_vertices).std() * np.sqrt(3) * directions / np.linalg.norm(directions, axis=1)[:, None]
     scan = scan[scan[:, 2] >= np.quantile(scan[:, 2], 1 - share)]
     sides = any_pose._Sides.of(model, scan, False, 0)
-    starts = len(sides._placed(np.eye(3)[None])[0])
+    starts = len(sides._place_rotations(np.eye(3)[None])[0])
     assert starts == (8 if is_part else 2)

@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull
 from shapespace.datasets.simulated_scan import Cut, simulate_scan
 from shapespace.errors import FitError, InputError
 from shapespace.fit.completion.complete import Completion, CompletionConfig, complete, refine_surface
-from shapespace.fit.completion.shape_posterior import _Data, leave_one_out
+from shapespace.fit.completion.shape_posterior import _DataLikelihood, leave_one_out
 from shapespace.fit.dense.residual_modes import ResidualModes
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.geometry.closest import build_engine
@@ -103,7 +103,7 @@ def test_posterior_mean_and_evidence_are_those_of_gaussian_process_regression(ro
     """With A the rows of the observations, S the prior: S A^T (A S A^T + I)^-1 y, and log N(y; 0, A S A^T + I)."""
     rng = np.random.default_rng(rows)
     A, y, variance = rng.standard_normal((rows, 6)), rng.standard_normal(rows), rng.uniform(0.5, 3.0, 6)
-    data, K = _Data(A.T @ A, A.T @ y), A @ np.diag(variance) @ A.T + np.eye(rows)
+    data, K = _DataLikelihood(A.T @ A, A.T @ y), A @ np.diag(variance) @ A.T + np.eye(rows)
     assert np.allclose(data.mean(variance), variance * (A.T @ np.linalg.solve(K, y)))
 
     def log_density(K: FloatArray) -> float:
@@ -209,7 +209,7 @@ def test_the_other_side_improves_what_the_model_says() -> None:
         completion = complete(model, scan, config, T_scan_model=Similarity.identity())
         errors[mirror] = np.linalg.norm(completion.vertices - truth, axis=1)[truth[:, 0] > 0].mean()
     assert errors["alone"] < errors["never"] and errors["combined"] < errors["never"], errors
-    with pytest.raises(InputError, match="leave --mirror out"):
+    with pytest.raises(InputError, match="omit --mirror"):
         complete(MODEL, cut_scan(np.zeros(5), -0.2)[0], replace(FORM, mirror="combined"))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from shapespace.errors import FitError, InputError
-from shapespace.fit.dense.dense_fit import _field, _laplacian, dense_surface, revert_folds
+from shapespace.fit.dense.dense_fit import _laplacian, _matern_field, dense_surface, revert_folds
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.robust.prepared_model import prepare
 from shapespace.fit.robust.robust_settings import DenseSettings
@@ -211,7 +211,7 @@ def test_it_is_the_same_every_time_and_in_every_frame() -> None:
 
 def test_the_field_solves_its_normal_equations() -> None:
     m, rng = blob_model(vertices=200), np.random.default_rng(0)
-    field, count = _field(m, 60.0, 2.0), m.n_vertices
+    field, count = _matern_field(m, 60.0, 2.0), m.n_vertices
     t = field.topology
     A = np.diag(field.diagonal)
     rows = np.repeat(np.arange(count), np.diff(t.ring_start))
@@ -246,7 +246,7 @@ def test_the_laplacian_knows_constants_and_a_sphere() -> None:
 
 
 def test_nothing_to_match_is_said() -> None:
-    with pytest.raises(FitError, match=r"bumpy\.ply: too little of it matches"):
+    with pytest.raises(FitError, match=r"bumpy\.ply: too few of its points match"):
         dense(scanned(count=20))
 
 

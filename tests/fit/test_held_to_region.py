@@ -72,7 +72,7 @@ def test_what_the_region_does_not_tell_is_as_uncertain_as_before() -> None:
     outside = np.setdiff1d(np.arange(1500), small)
     assert (part.regions[outside] == UNSEEN).all() and (part.regions[list(small)] != UNSEEN).any()
     assert part.landmark_stddev_mm is not None and set(part.landmark_stddev_mm) == {"tip"}
-    assert any(note.startswith("Held to the region of") for note in part.notes)
+    assert any(note.startswith("Restricted to the region of") for note in part.notes)
 
 
 def test_one_coefficient_vector_stands_for_the_same_shape_in_part_and_whole() -> None:
@@ -108,7 +108,7 @@ def test_a_region_that_cannot_be_is_refused(region: str | tuple[int, ...], said:
 
 
 def test_a_dense_stage_is_not_held_to_a_region() -> None:
-    with pytest.raises(InputError, match="leave out dense, or the region"):
+    with pytest.raises(InputError, match="omit dense, or the region"):
         FitConfig(dense=True, region="face")
 
 

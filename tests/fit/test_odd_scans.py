@@ -13,7 +13,7 @@ from shapespace.fit.diagnostics.failure_model import FitEvidence, chirality_of, 
 from shapespace.fit.diagnostics.reasons import Reason, ReasonCode, text_of
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.iteration_state import RobustFitted, last_of
-from shapespace.fit.method import Ended
+from shapespace.fit.method import FitOutcome
 from shapespace.fit.result import FitResult
 from shapespace.fit.robust.robust_icp import robust_icp
 from shapespace.fit.robust.robust_method import Robust
@@ -81,7 +81,9 @@ def test_a_scan_is_called_mirrored_only_by_a_model_with_its_training_shapes() ->
 
 def converged(evidence: FitEvidence) -> Reason:
     fitted = replace(last_fit(), evidence=evidence)
-    return Robust().reason(Ended(blob_model(), Start(Similarity.identity(), "given", np.nan), fitted, {}, {}, 80.0))
+    return Robust().reason(
+        FitOutcome(blob_model(), Start(Similarity.identity(), "given", np.nan), fitted, {}, {}, 80.0)
+    )
 
 
 @cache

@@ -79,7 +79,7 @@ def test_they_hold_the_variance_of_the_whole_covariance() -> None:
 def test_the_strongest_products_stand_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
     model = blob_model(400)
     monkeypatch.setattr(residual, "MOST_PRODUCTS", 45)
-    made = residual._make(model, SETTINGS)
+    made = residual._compute_modes(model, SETTINGS)
     assert share_held(made, covariance(model, SETTINGS, mirrored=False)) > 0.97
 
 
@@ -99,9 +99,9 @@ def test_a_lopsided_mean_has_no_mirror_image() -> None:
 
 def test_blocks_change_nothing_but_the_rounding(monkeypatch: pytest.MonkeyPatch) -> None:
     model = symmetric_model()
-    before = residual._make(model, SETTINGS)
+    before = residual._compute_modes(model, SETTINGS)
     monkeypatch.setattr(local_modes, "_BLOCK", 37)
-    after = residual._make(model, SETTINGS)
+    after = residual._compute_modes(model, SETTINGS)
     np.testing.assert_allclose(after.stddev, before.stddev, rtol=1e-4)
     # The same span, whatever the signs.
     np.testing.assert_allclose(np.linalg.svd(flat(before).T @ flat(after))[1], 1.0, atol=1e-3)
@@ -116,8 +116,8 @@ def test_they_are_made_once_a_model_and_settings() -> None:
 def test_those_of_a_model_in_a_file_are_found_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SHAPESPACE_CACHE", str(tmp_path))
     monkeypatch.delenv("SHAPESPACE_KEEP")
-    made, asked = residual._make, []
-    monkeypatch.setattr(residual, "_make", lambda *of: asked.append(of) or made(*of))
+    made, asked = residual._compute_modes, []
+    monkeypatch.setattr(residual, "_compute_modes", lambda *of: asked.append(of) or made(*of))
 
     def ask(model: ShapeModel, settings: ResidualSettings) -> tuple[ResidualModes, bool]:
         before = len(asked)

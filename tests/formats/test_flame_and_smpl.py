@@ -81,7 +81,7 @@ def test_bodies_and_hands_have_shape_alone(joints: int, family: str, tmp_path: P
     path = saved(parts(joints, 10), tmp_path, ".pkl")
     model = ShapeModel.load(path)
     assert model.n_modes == 10 and model.licence.startswith(f"{family}:")
-    with pytest.raises(ModelFileError, match="does not part"):
+    with pytest.raises(ModelFileError, match="does not separate"):
         AdditiveModel.load(path)
 
 

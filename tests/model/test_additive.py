@@ -180,7 +180,7 @@ def test_its_file_reads_as_the_plain_model_too(model: AdditiveModel, tmp_path: P
 
 def test_a_plain_model_is_not_taken_for_one(model: AdditiveModel, tmp_path: Path) -> None:
     model.shape.save(tmp_path / "plain.h5")
-    with pytest.raises(ModelFileError, match="does not part identity and expression"):
+    with pytest.raises(ModelFileError, match="does not separate identity and expression"):
         AdditiveModel.load(tmp_path / "plain.h5")
 
 

@@ -91,7 +91,7 @@ def test_a_vertex_that_nobody_has_and_a_shape_of_which_little_is_there_are_refus
     with pytest.raises(InputError, match="Vertex 17 is missing in every mesh"):
         fill_holes(nowhere, faces, ["x"] * len(holed))
     holed[3, 2:] = np.nan
-    with pytest.raises(InputError, match="third: too little of it is there"):
+    with pytest.raises(InputError, match="third: too few of its vertices are observed"):
         fill_holes(holed, faces, ["a", "b", "c", "third", *["d"] * 8])
 
 
@@ -101,7 +101,7 @@ def test_infinite_vertices_are_refused() -> None:
     x[5, 1] = np.inf
     given[2] = given[2].with_vertices(x)
     for representation in ("vertices", "bspline"):
-        with pytest.raises(InputError, match=r"sheet_2\.ply holds vertices that are not finite"):
+        with pytest.raises(InputError, match=r"sheet_2\.ply has vertices that are not finite"):
             ShapeModel.fit(given, representation=representation)
 
 
@@ -208,9 +208,9 @@ def test_build_makes_a_model_of_meshes_with_holes_and_info_tells_it(
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--representation", "bspline", "--control-points", "24"], "must be two whole numbers such as 24x24"),
-        (["--representation", "bspline", "--control-points", "8x8x8"], "must be two whole numbers such as 24x24"),
-        (["--representation", "bspline", "--control-points", "-8x8"], "expected one argument|two whole numbers"),
+        (["--representation", "bspline", "--control-points", "24"], "must be two integers such as 24x24"),
+        (["--representation", "bspline", "--control-points", "8x8x8"], "must be two integers such as 24x24"),
+        (["--representation", "bspline", "--control-points", "-8x8"], "expected one argument|two integers"),
         (["--representation", "bspline", "--control-points", "2x2"], "4 to 64 control points along each"),
         (["--representation", "bspline", "--control-points", "64x64"], "more than the 500 vertices"),
         (["--control-points", "8x8"], "Only B-spline surfaces have control points"),

@@ -231,6 +231,6 @@ def test_directions_that_are_rounding_are_not_blown_up() -> None:
     basis = [np.linalg.qr(rng.standard_normal((50, 5)))[0]]
     W = rng.standard_normal((50, 2)) @ np.array([[1.0, 1.0, 0.0], [0.0, 1e-16, 1.0]])
     W -= basis[0] @ (basis[0].T @ W)
-    Q, beyond = krylov._orthonormal(W, basis, 1e-13)
+    Q, beyond = krylov._orthonormalise(W, basis, 1e-13)
     assert Q.shape == (50, 2) and np.allclose(Q @ beyond, W)
     assert np.abs(basis[0].T @ Q).max() < 1e-14

@@ -241,7 +241,7 @@ def test_what_cannot_be_used_is_refused_in_one_sentence() -> None:
     meshes = training_meshes(vertices=200)[:4]
     nothing = np.ones((4, 200), dtype=bool)
     nothing[2] = False
-    with pytest.raises(InputError, match=r"blob_2\.ply: all of its vertices are missing; leave it out"):
+    with pytest.raises(InputError, match=r"blob_2\.ply: all of its vertices are missing; exclude this mesh"):
         ShapeModel.fit(holed(meshes, nothing))
     nothing[2, :3] = True
     with pytest.raises(InputError, match=r"blob_2\.ply"):
@@ -251,10 +251,10 @@ def test_what_cannot_be_used_is_refused_in_one_sentence() -> None:
         ShapeModel.fit(holed(meshes, thirds))
     with pytest.raises(InputError, match="share of meshes"):
         ObservedMeshes.of(meshes, 0.0)
-    with pytest.raises(InputError, match="20 % of the meshes and two of them"):
+    with pytest.raises(InputError, match="20 % of the meshes and by at least two"):
         ShapeModel.fit(holed(meshes, thirds), min_seen=0.2)
     apart = np.stack([np.arange(200) < 120, np.arange(200) < 120, np.arange(200) > 117, np.arange(200) > 117])
-    with pytest.raises(InputError, match="too little of it is there to be aligned with the other"):
+    with pytest.raises(InputError, match="too few of its vertices are observed to align it with the other"):
         ShapeModel.fit(holed(meshes, apart))
     equal = [meshes[0], *(meshes[0].with_vertices(meshes[0].vertices) for _ in range(3))]
     with pytest.raises(InputError, match="all equal"):
@@ -274,11 +274,11 @@ def test_the_command_tells_what_is_missing_and_what_is_taken_out(
     assert cli.main(["build", str(tmp_path), "-o", str(tmp_path / "m.h5"), "--modes", "2"]) == 0
     said = capsys.readouterr().err
     assert "24 of 1200 vertices are missing (2.0 %), in 4 of 6 meshes." in said
-    assert "1 vertex is taken out of the model, since fewer than 50 % of the meshes show" in said
+    assert "1 vertex is removed from the model, since fewer than 50 % of the meshes show" in said
     assert "The model has no gone" in said
     assert dict(ShapeModel.load(tmp_path / "m.h5").landmarks) == {"there": 99}
     assert cli.main(["build", str(tmp_path), "-o", str(tmp_path / "m.h5"), "--modes", "2", "--min-seen", "0.3"]) == 0
     assert "taken out" not in capsys.readouterr().err
     (tmp_path / "l.csv").write_text("file,subject,label\n" + "".join(f"{m.name},a,neutral\n" for m in meshes))
     assert cli.main(["build", str(tmp_path), "-o", str(tmp_path / "m.h5"), "--additive", str(tmp_path / "l.csv")]) == 2
-    assert "needs whole meshes" in capsys.readouterr().err
+    assert "needs complete meshes" in capsys.readouterr().err

@@ -17,7 +17,7 @@ from shapespace.statistics.compare_shapes import complete_cohort
 from shapespace.types import FloatArray, Mesh
 from synthetic_shapes import training_meshes
 
-FEWER = "The 6 training shapes determine 5 modes, so the model has 5 and not the 30 asked for."
+FEWER = "The 6 training shapes determine 5 modes, so the model has 5 and not the requested 30."
 
 
 def of_few_modes(count: int, modes: int) -> list[Mesh]:
@@ -49,7 +49,7 @@ def test_a_model_has_the_modes_that_its_shapes_determine_and_a_note(options: dic
 def test_shapes_that_vary_along_few_directions_determine_no_more_modes() -> None:
     model = build_model(of_few_modes(12, 3), BuildConfig(modes=8, align=False))
     assert model.n_modes == 3
-    assert model.notes == ("The 12 training shapes determine 3 modes, so the model has 3 and not the 8 asked for.",)
+    assert model.notes == ("The 12 training shapes determine 3 modes, so the model has 3 and not the requested 8.",)
 
 
 @pytest.mark.parametrize("modes", [1, 4, 5, 0.9, "all", None, "auto"])
@@ -95,7 +95,7 @@ def test_identity_and_expression_have_the_modes_that_their_shapes_determine(face
     people = [mesh.name for mesh in faces_in_memory]
     model = AdditiveModel.fit([*faces_in_memory, *moved], people * 2, [True] * 4 + [False] * 4, identity_modes=9)
     assert model.n_identity == 3
-    assert "The 4 neutral shapes determine 3 modes, so the model has 3 and not the 9 asked for." in model.shape.notes
+    assert "The 4 neutral shapes determine 3 modes, so the model has 3 and not the requested 9." in model.shape.notes
 
 
 def test_the_command_prints_the_note_and_its_answer_contains_it(

@@ -189,7 +189,7 @@ def test_fewer_modes_than_one_are_refused(modes: int) -> None:
 
 @pytest.mark.parametrize("modes", ["Auto", "5", [3], "auto"])
 def test_modes_that_are_no_number_are_refused(modes: object) -> None:
-    with pytest.raises(InputError, match="whole number"):
+    with pytest.raises(InputError, match="must be an integer"):
         principal_components(low_rank(6, 60, 3), modes)
 
 

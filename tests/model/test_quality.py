@@ -125,7 +125,7 @@ def test_correspondences_of_other_vertices_are_judged_against_the_same_scans() -
     far = [m.with_vertices(m.vertices + 100.0) for m in scans]
     with pytest.raises(InputError, match=r"lies .* mm from its scan"):
         measure_quality(blobs(10), FEW, scans=far)
-    with pytest.raises(InputError, match="one scan a mesh"):
+    with pytest.raises(InputError, match="one scan per mesh"):
         measure_quality(blobs(10), FEW, scans=scans[:3])
 
 

@@ -218,7 +218,7 @@ def test_another_topology_is_refused_by_name(faces: str) -> None:
 def test_vertices_that_are_not_finite_are_refused_by_name() -> None:
     vertices = np.array(training_meshes(vertices=200)[2].vertices)
     vertices[7, 1] = -np.inf
-    with pytest.raises(InputError, match=r"bad\.ply holds vertices that are not finite"):
+    with pytest.raises(InputError, match=r"bad\.ply has vertices that are not finite"):
         ShapeModel.fit(replaced(2, Mesh(vertices, training_meshes(vertices=200)[0].faces, name="bad.ply")))
 
 

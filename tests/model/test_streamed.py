@@ -200,7 +200,7 @@ def one_less(mesh: Mesh) -> Mesh:
 BAD = {
     with_hole: (InputError, "blob_5.ply: vertices are missing"),
     flat: (InputError, "blob_5.ply: its vertices lie on a line"),
-    far: (InputError, "blob_5.ply holds vertices that are not finite"),
+    far: (InputError, "blob_5.ply has vertices that are not finite"),
     other_triangles: (CorrespondenceError, "blob_5.ply and .* have different triangles"),
     one_less: (CorrespondenceError, "blob_5.ply has 199 vertices but .* 200"),
 }
@@ -319,7 +319,7 @@ def test_two_builds_do_not_share_a_folder(tmp_path: Path) -> None:
 
     def begin(what: str) -> None:
         if not second:
-            with pytest.raises(FileError, match="Another build is at work") as refused:
+            with pytest.raises(FileError, match="Another build is running") as refused:
                 ShapeModel.fit(posed(), modes=2, out_of_core=True, scratch=scratch)
             second.append(str(refused.value))
 
@@ -347,7 +347,7 @@ def test_one_shape_can_be_added(tmp_path: Path) -> None:
     meshes = posed(9)
     old = ShapeModel.fit(meshes[:8], modes=2, keep_shapes=tmp_path / "kept")
     assert furthest(old.with_more(meshes[8:], tmp_path / "kept", modes=2), ShapeModel.fit(meshes, modes=2)) < 1e-6
-    with pytest.raises(InputError, match="no meshes to be added"):
+    with pytest.raises(InputError, match="no meshes to add"):
         old.with_more([], tmp_path / "kept")
 
 
@@ -391,18 +391,18 @@ def test_the_number_of_modes_is_chosen_by_a_bounded_number_of_shapes(monkeypatch
     data = rng.standard_normal((60, 3)) * [9, 7, 5] @ rng.standard_normal((3, 90)) + 0.1 * rng.standard_normal((60, 90))
     whole = choosing.choose_modes(data)
     monkeypatch.setattr(choosing, "MOST_SHAPES", 40)
-    rows = choosing.drawn(60, 0)
+    rows = choosing.sample_shapes(60, 0)
     assert len(rows) == len(set(rows)) == 40 and (np.diff(rows) > 0).all()
     some = choosing.choose_modes(data)
     assert len(some.error_mm) <= len(whole.error_mm) and some.modes == whole.modes == 3
     assert np.array_equal(some.error_mm, choosing.choose_modes(data[rows]).error_mm)
-    assert not np.array_equal(choosing.drawn(60, 1), rows)
+    assert not np.array_equal(choosing.sample_shapes(60, 1), rows)
 
 
 def test_a_streamed_choice_of_modes_looks_at_a_bounded_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with Spill(tmp_path / "t.f32", 50, 90, new=True) as table:
         table.write_rows(0, np.arange(4500.0).reshape(50, 90))
-        assert np.array_equal(streamed._sample(table, 0), np.arange(4500.0).reshape(50, 90))
+        assert np.array_equal(streamed._sample_shapes(table, 0), np.arange(4500.0).reshape(50, 90))
         monkeypatch.setattr(streamed, "_SAMPLE_BYTES", 8 * 50 * 30)
-        part = streamed._sample(table, 0)
+        part = streamed._sample_shapes(table, 0)
     assert part.shape == (50, 30) and np.array_equal(part[0, :6], [0, 1, 2, 9, 10, 11])

@@ -1,4 +1,4 @@
-"""The command line: parsing, printing and exit codes; what the commands do stands in `commands`.
+"""The command line: parsing, printing and exit codes; the commands themselves are in `commands`.
 
 Exit codes: 0 done; 1 some of several scans failed (or, under --strict, are doubtful); 2 wrong arguments or unusable
 input; 130 stopped by Ctrl-C, 143 by SIGTERM and 129 by SIGHUP, files valid.
@@ -27,11 +27,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            # A file's name may hold what the terminal's encoding cannot show.
+            # The name of a file may contain characters that the encoding of the terminal lacks.
             stream.reconfigure(errors="backslashreplace")
     arguments = parser().parse_args(argv)
     try:
-        with _ended_as_asked():
+        with _raise_on_signals():
             code = int(arguments.run(arguments))
         sys.stdout.flush()
         return code
@@ -42,20 +42,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         say("shapespace: there is not enough memory for this; give fewer or smaller meshes, or fewer --jobs.")
         return 2
     except KeyboardInterrupt as ended:
-        say(f"shapespace: stopped; the files written so far are whole{getattr(arguments, 'goes_on', '')}.")
-        return 128 + (ended.signal if isinstance(ended, _Ended) else signal.SIGINT)
+        say(f"shapespace: stopped; the files written so far are complete{getattr(arguments, 'goes_on', '')}.")
+        return 128 + (ended.signal if isinstance(ended, _TerminationSignal) else signal.SIGINT)
     except BrokenPipeError:
         _drop_output()
         return 0
     except OSError as error:
         _drop_output()
         where = f" ({error.filename})" if error.filename else ""
-        say(f"shapespace: the system refused{where}: {error.strerror or error}; check the path and the free space.")
+        say(f"shapespace: the system reports{where}: {error.strerror or error}; check the path and the free space.")
         return 2
 
 
-class _Ended(KeyboardInterrupt):
-    """A signal asks this process to end."""
+class _TerminationSignal(KeyboardInterrupt):
+    """A signal that ends this process."""
 
     def __init__(self, number: int) -> None:
         super().__init__()
@@ -63,12 +63,12 @@ class _Ended(KeyboardInterrupt):
 
 
 @contextlib.contextmanager
-def _ended_as_asked() -> Generator[None]:
-    """End by the signals of Ctrl-C, of clusters and of closing terminals alike, whatever code they meet."""
-    asked: list[_Ended] = []
+def _raise_on_signals() -> Generator[None]:
+    """Let the signals of Ctrl-C, of clusters and of closing terminals all raise, wherever they arrive."""
+    asked: list[_TerminationSignal] = []
 
     def end(number: int, _frame: object) -> None:
-        asked.append(_Ended(number))
+        asked.append(_TerminationSignal(number))
         raise asked[-1]
 
     if threading.current_thread() is not threading.main_thread():
@@ -76,14 +76,14 @@ def _ended_as_asked() -> Generator[None]:
         return
     taken = [number for name in _ENDING if (number := getattr(signal, name, None)) is not None]
     before = {number: signal.getsignal(number) for number in taken}
-    # Under nohup SIGHUP is ignored, and stays so.
+    # Under nohup SIGHUP is ignored, and stays ignored.
     before = {k: was for k, was in before.items() if was in (signal.SIG_DFL, signal.default_int_handler)}
     for number in before:
         signal.signal(number, end)
     try:
         yield
     except Exception:
-        # Compiled code that a signal meets may raise another error in its place.
+        # Compiled code that receives a signal may raise another error instead.
         if asked:
             raise asked[0] from None
         raise
@@ -93,6 +93,6 @@ def _ended_as_asked() -> Generator[None]:
 
 
 def _drop_output() -> None:
-    """Send what is left of the output nowhere, so that python does not complain when it flushes at exit."""
+    """Discard the remaining output, so that python does not report an error when it flushes at exit."""
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

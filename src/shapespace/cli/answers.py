@@ -29,7 +29,7 @@ def column_value(text: str, option: str) -> tuple[str, str]:
     """Return the column and the value of COLUMN=VALUE.
 
     Raises:
-        InputError: it is something else.
+        InputError: the text has another form.
     """
     column, _, value = (part.strip() for part in text.partition("="))
     if not (column and value):
@@ -41,16 +41,16 @@ def cohort_of(
     arguments: argparse.Namespace, data: Path | None = None, *, onto: Cohort | None = None, least: int = 2,
     accept_review: bool | None = None, surfaces: Surfaces | None = None, **fixed: Any,
 ) -> Cohort:  # fmt: skip
-    """Return a cohort that the arguments name, with the settings of its file and of --set.
+    """Return a cohort from the arguments, with the settings of its file and of --set.
 
     Args:
         arguments: parsed arguments of a command that reads a cohort.
-        data: its data; None for those of the arguments.
+        data: path of the data; None for the data of the arguments.
         onto: a cohort that this one is compared with.
-        least: the smallest number of shapes, if `onto` is None.
-        accept_review: see `CohortConfig`.
-        surfaces: those of the question, where neither the file nor --set chooses them.
-        fixed: settings that the question does not leave open.
+        least: smallest number of shapes, if `onto` is None.
+        accept_review: whether surfaces that need review are accepted, see `CohortConfig`.
+        surfaces: surfaces for the question, if neither the file nor --set chooses them.
+        fixed: settings that are fixed for the question.
     """
     from shapespace.batch.progress import steps
     from shapespace.cohort.read import CohortConfig, is_cohort_file, read_cohort, read_cohort_file
@@ -71,7 +71,7 @@ def cohort_of(
 
 
 def answer_cohort(arguments: argparse.Namespace) -> Outcome:
-    """Write a cohort file, and say what the cohort is."""
+    """Write a cohort file, and summarise the cohort."""
     from shapespace.batch.progress import steps
     from shapespace.cohort.read import CohortConfig, read_cohort, write_cohort_file
 
@@ -100,7 +100,7 @@ def result_figures(arguments: argparse.Namespace) -> Outcome:
     return Outcome(facts, [line], notes)
 
 
-def _answer(
+def _compute_and_report(
     arguments: argparse.Namespace, doing: str, what: str, compute: Callable[..., _Result],
     report: Callable[[_Result], AnalysisReport], count: int | None = None,
 ) -> Outcome:  # fmt: skip
@@ -110,18 +110,18 @@ def _answer(
         arguments: parsed arguments.
         doing: text of the progress bar, such as `permuting`.
         what: name of one step, such as `shape`.
-        compute: takes `progress`.
-        report: of the result.
+        compute: function of `progress` that returns the result.
+        report: function that makes the report of the result.
         count: number of steps, if it is known.
     """
     from shapespace.batch.progress import steps
 
     with steps(count, doing, what, quiet=arguments.quiet) as step:
         result = compute(progress=step)
-    return _written(report(result), arguments)
+    return _write_report(report(result), arguments)
 
 
-def _written(report: AnalysisReport, arguments: argparse.Namespace) -> Outcome:
+def _write_report(report: AnalysisReport, arguments: argparse.Namespace) -> Outcome:
     from shapespace.commands.answers import write_answer
 
     return write_answer(report, arguments.output, quiet=arguments.quiet)
@@ -157,7 +157,7 @@ def answer_asymmetry(arguments: argparse.Namespace) -> Outcome:
     pairs = None if arguments.pairs is None else read_pairs(arguments.pairs, cohort)
     options = given(arguments, measure_asymmetry, pairs=pairs, reference=reference)
     compute = partial(measure_asymmetry, cohort, **options, where=str(arguments.pairs))
-    return _answer(arguments, "permuting", "shape", compute, asymmetry_report)
+    return _compute_and_report(arguments, "permuting", "shape", compute, asymmetry_report)
 
 
 def answer_change(arguments: argparse.Namespace) -> Outcome:
@@ -170,7 +170,7 @@ def answer_change(arguments: argparse.Namespace) -> Outcome:
     cohort = cohort_of(arguments, gauge="form")
     regions = {name: read_region(path) for name, path in arguments.region} or None
     config = ChangeConfig(**given(arguments, ChangeConfig, regions=regions))
-    return _answer(arguments, "comparing", "subject", partial(change, cohort, config), change_report)
+    return _compute_and_report(arguments, "comparing", "subject", partial(change, cohort, config), change_report)
 
 
 def answer_compare(arguments: argparse.Namespace) -> Outcome:
@@ -181,7 +181,7 @@ def answer_compare(arguments: argparse.Namespace) -> Outcome:
     config = CompareConfig(**given(arguments, CompareConfig, errors=dict(arguments.error)))
     cohort = cohort_of(arguments)
     compute = partial(compare, cohort, arguments.formula, config)
-    return _answer(arguments, "permuting", "step", compute, compare_report)
+    return _compute_and_report(arguments, "permuting", "step", compute, compare_report)
 
 
 def answer_complete(arguments: argparse.Namespace) -> Outcome | int:
@@ -203,7 +203,7 @@ def answer_complete(arguments: argparse.Namespace) -> Outcome | int:
     )  # fmt: skip
     if not collected.count:
         return 2
-    outcome = _written(collected.report(len(failed)), arguments)
+    outcome = _write_report(collected.report(len(failed)), arguments)
     write_text(arguments.output / METHODS_FILE, collected.methods_text())
     return replace(outcome, exit_code=int(bool(failed)))
 
@@ -214,7 +214,7 @@ def answer_verify(arguments: argparse.Namespace) -> Outcome:
     from shapespace.statistics.identity.verify import verify
 
     cohort, config = _cohort_and_config(arguments)
-    return _answer(arguments, "comparing", "draw", partial(verify, cohort, config), verify_report)
+    return _compute_and_report(arguments, "comparing", "draw", partial(verify, cohort, config), verify_report)
 
 
 def answer_identify(arguments: argparse.Namespace) -> Outcome:
@@ -223,7 +223,7 @@ def answer_identify(arguments: argparse.Namespace) -> Outcome:
     from shapespace.statistics.identity.identify import identify
 
     cohort, config = _cohort_and_config(arguments)
-    return _answer(arguments, "searching", "score", partial(identify, cohort, config), identify_report)
+    return _compute_and_report(arguments, "searching", "score", partial(identify, cohort, config), identify_report)
 
 
 def _cohort_and_config(arguments: argparse.Namespace) -> tuple[Cohort, IdentityConfig]:
@@ -241,7 +241,7 @@ def answer_morphospace(arguments: argparse.Namespace) -> Outcome:
     from shapespace.statistics.shape_tests.ordination import ordinate
 
     result = ordinate(cohort_of(arguments), **given(arguments, ordinate))
-    return _written(morphospace_report(result, arguments.axes), arguments)
+    return _write_report(morphospace_report(result, arguments.axes), arguments)
 
 
 def answer_regress(arguments: argparse.Namespace) -> Outcome:
@@ -269,14 +269,14 @@ def answer_regress(arguments: argparse.Namespace) -> Outcome:
         learned = Predictor.load(arguments.predictor)
         surfaces: Surfaces | None = "coefficients" if learned.model_hash else None
         cohort = cohort_of(arguments, least=1, surfaces=surfaces, gauge=learned.gauge)
-        return _written(prediction_report(learned, cohort, learned.predict(cohort)), arguments)
+        return _write_report(prediction_report(learned, cohort, learned.predict(cohort)), arguments)
     cohort = cohort_of(arguments)
     if arguments.along is not None:
         hold = dict(column_value(word, "--set hold") for word in arguments.hold or ())
         options = {**given(arguments, predict_shapes, hold=hold), **shared}
         options = {name: value for name, value in options.items() if value is not None}
         compute = partial(predict_shapes, cohort, **options)
-        return _answer(arguments, "flipping signs", "step", compute, shape_prediction_report)
+        return _compute_and_report(arguments, "flipping signs", "step", compute, shape_prediction_report)
     with steps(None, "learning", "fold", quiet=arguments.quiet) as step:
         result = regress(cohort, arguments.target, folds=arguments.folds, **shared, progress=step)
     new = None
@@ -288,7 +288,7 @@ def answer_regress(arguments: argparse.Namespace) -> Outcome:
         new = (fresh, result.predictor.predict(fresh))
     make_folder(arguments.output)
     result.predictor.save(arguments.output / "predictor.npz")
-    return _written(regression_report(result, new), arguments)
+    return _write_report(regression_report(result, new), arguments)
 
 
 def answer_score(arguments: argparse.Namespace) -> Outcome:
@@ -303,7 +303,7 @@ def answer_score(arguments: argparse.Namespace) -> Outcome:
     )
     subjects = cohort_of(arguments, onto=reference, surfaces="coefficients")
     compute = partial(score, reference, subjects, config)
-    return _answer(arguments, "scoring", "subject", compute, score_report, len(subjects))
+    return _compute_and_report(arguments, "scoring", "subject", compute, score_report, len(subjects))
 
 
 def answer_shape_tests(arguments: argparse.Namespace) -> Outcome:
@@ -313,14 +313,14 @@ def answer_shape_tests(arguments: argparse.Namespace) -> Outcome:
     test = arguments.shape_test
     function = resolve_name(f"shapespace.statistics.shape_tests.{test.function}")
     compute = partial(function, cohort_of(arguments), **given(arguments, function))
-    return _answer(arguments, "permuting", "permutation", compute, shape_test_report)
+    return _compute_and_report(arguments, "permuting", "permutation", compute, shape_test_report)
 
 
 def answer_export(arguments: argparse.Namespace) -> Outcome:
     """Write fits of a store as single files, or all of them as a table; with `--to`, the shapes of a cohort.
 
     Raises:
-        InputError: options of both.
+        InputError: options of both kinds of export are combined.
     """
     from shapespace.commands.export import export, export_cohort
 
@@ -330,7 +330,7 @@ def answer_export(arguments: argparse.Namespace) -> Outcome:
             quiet=arguments.quiet, say=warn,
         )  # fmt: skip
     if arguments.names or arguments.all or arguments.table is not None:
-        raise InputError("--to exports all shapes of DATA; leave out names, --all and --table.")
+        raise InputError("--to exports all shapes of DATA; omit names, --all and --table.")
     if arguments.formula is not None and arguments.to != "geomorph":
         raise InputError("--formula is the model of the script for geomorph; give --to geomorph too.")
     arguments.data = arguments.store

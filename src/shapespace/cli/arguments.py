@@ -36,10 +36,10 @@ def parser() -> argparse.ArgumentParser:
 
 
 class CommandParser(argparse.ArgumentParser):
-    """The parser of a command, whose options are added when they are first needed.
+    """The parser of a command, whose options are added on first use.
 
     Args:
-        command: None for a parser of commands.
+        command: the command; None for a parser of commands.
         **keywords: See `argparse.ArgumentParser`.
     """
 
@@ -59,7 +59,7 @@ class CommandParser(argparse.ArgumentParser):
                 option = text.partition("=")[0]
                 if option.startswith("--") and not any(name.startswith(option) for name in known):
                     name = option.removeprefix("--").replace("-", "_")
-                    if name in [one.names for one in self._command.settings]:
+                    if name in [setting.names for setting in self._command.settings]:
                         self.error(f"there is no option {option}; write --set {name}=VALUE")
                     self.error(f"there is no option {option}{_suggestion(option, known)}")
         parsed, unknown = super().parse_known_args(args, namespace)
@@ -104,9 +104,9 @@ class CommandParser(argparse.ArgumentParser):
         elif more:
             self.epilog += f"\n\n{more} more options: {self.prog} --help-all"
         self.add_argument("--help-all", action=_HelpAll, help="show all options and exit")
-        self._add(command.options, help_level)
+        self._add_group(command.options, help_level)
 
-    def _add(self, options: Sequence[Option], help_level: str) -> None:
+    def _add_group(self, options: Sequence[Option], help_level: str) -> None:
         advanced = self.add_argument_group("advanced options")
         exclusive: dict[str, Container] = {}
         for option in options:

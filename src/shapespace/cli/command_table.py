@@ -59,7 +59,7 @@ CONVERT = Source("commands.convert", "convert")
 _UNITS = ("um", "mm", "cm", "inch", "m")
 _ABOUT_MESHES = "kept in the model file (default: from about.json next to the meshes)"
 _REPRESENTATIONS = ("vertices", "bspline", "bspline-detail")
-_GOES_ON: Mapping[str, Any] = {"goes_on": "; the same command goes on from there"}
+_GOES_ON: Mapping[str, Any] = {"goes_on": "; the same command continues from there"}
 
 GROUPS: Mapping[str, str] = {
     "data": "open data sets, and simulated faces, organs, bones and landmarks",
@@ -67,7 +67,7 @@ GROUPS: Mapping[str, str] = {
     "test": "tests of shape beyond linear models: disparity, covariation, phylogeny, equivalence",
     "recognise": "classify scans (for example, facial expressions) by fitted coefficients",
 }
-"""Commands that have commands."""
+"""Commands that consist of subcommands."""
 
 
 @dataclass(frozen=True)
@@ -75,11 +75,11 @@ class Command:
     """A command.
 
     Args:
-        name: its words after `shapespace`.
-        summary: what it does, without a capital and a full stop.
+        name: words of the command after `shapespace`.
+        summary: summary of the task, without a capital and a full stop.
         examples: command lines.
-        run: module and name of the function that runs it, as of `cli.dispatch.run_command`.
-        arguments: Its arguments in the order of the help.
+        run: module and name of the function that runs it, see `cli.dispatch.run_command`.
+        arguments: arguments in the order of the help.
         details: paragraphs on what it reads and writes, for `--help-all` and the reference.
         json: whether it prints facts, with `--json`.
         defaults: further attributes of the parsed arguments.
@@ -100,12 +100,12 @@ class Command:
 
     @property
     def options(self) -> tuple[Option, ...]:
-        """All arguments, those included that every command has."""
+        """All arguments, including those of every command."""
         return (*self.arguments, *((SET,) if self.settings else ()), *((JSON,) if self.json else ()), QUIET)
 
     @property
     def usage(self) -> str:
-        """The command line, with what must be given."""
+        """The command line with the required arguments."""
         endings = {"+": "...", "*": "...]", "?": "]"}
         words = ["shapespace", self.name]
         for option in self.options:
@@ -132,13 +132,13 @@ _SLIDERS = basic("--sliders", "FILE.csv", source=LANDMARKS_CONVERT, parse=Path, 
 _SAME = basic("scans", "SAME", "folder that correspond wrote", parse=Path)
 _RECURSIVE = advanced("--recursive", help="also search subfolders of the given folders")
 _STRICT_HELP = (
-    "refuse scans with coordinates that are NaN or infinite (default: remove the triangles that use them, with a note)"
+    "reject scans with coordinates that are NaN or infinite (default: remove the triangles that use them, with a note)"
 )
 _NO_OPEN = advanced("--no-open", help="do not open the report in a browser")
 _MODEL_OF_FITS = advanced("--model", "MODEL.h5", "model file of the fits, if it was moved", parse=Path)
 _RESULTS = basic("results", "RESULTS", "a folder that fit wrote, or its coefficients.csv", parse=Path)
 _IDENTITY_RULES = (
-    "Scans are compared by the coefficients of their fits. DATA is a table or a folder of fits, as of compare, change, "
+    "Scans are compared by the coefficients of their fits. DATA is a table or a folder of fits, see compare, change, "
     "asymmetry, regress and score."
 )
 _MODES, _TARGET = "modes", "target"
@@ -161,7 +161,7 @@ _EXECUTION_SETTINGS = (
 )  # fmt: skip
 
 
-def _jobs(what: str) -> Option:
+def _jobs_option(what: str) -> Option:
     """Return the option of parallel runs; `what` is run."""
     return basic("--jobs", "N", f"{what} in parallel (default: one per core)", EXECUTION)
 
@@ -192,9 +192,9 @@ _COHORT = (_DATA, _OUTPUT, _SHAPES)
 """Arguments of a question: its cohort, and the output folder."""
 
 
-def _settings(*own: Option, without: tuple[str, ...] = ()) -> tuple[Option, ...]:
+def _question_settings(*own: Option, without: tuple[str, ...] = ()) -> tuple[Option, ...]:
     """Return the settings of a question: its own, and those of its cohort `without` some names."""
-    return (*own, *(one for one in COHORT_SETTINGS if one.names not in without))
+    return (*own, *(option for option in COHORT_SETTINGS if option.names not in without))
 
 
 _IDENTITY_OPTIONS = (
@@ -205,7 +205,7 @@ _IDENTITY_OPTIONS = (
     advanced("--scores", "LIST", source=IDENTITY),
     advanced("--modes", "K", source=IDENTITY),
 )
-_IDENTITY_SETTINGS = _settings(
+_IDENTITY_SETTINGS = _question_settings(
     setting("role", "COLUMN", source=IDENTITY),
     setting("folds", "N", source=IDENTITY),
     setting("uncertainty", source=IDENTITY),
@@ -242,7 +242,7 @@ def _shape_test(test: ShapeTest) -> Command:
             basic("--permutations", "N", source=source, parse=values.positive),
         ),
         defaults={"shape_test": test},
-        settings=_settings(setting("seed", "S", source=source)),
+        settings=_question_settings(setting("seed", "S", source=source)),
     )  # fmt: skip
 
 
@@ -367,8 +367,8 @@ COMMANDS: tuple[Command, ...] = (
             basic("--strict", help=_STRICT_HELP),
         ),
         (
-            "A finding is fixed (fitting repairs it), a note, or refused. The exit code is 0 if all files can be "
-            "used, 1 if some can, 2 if none can.",
+            "The report of a file lists defects that a fit repairs (fixed), notes, and defects that make the file "
+            "unusable. The exit code is 0 if all files can be used, 1 if some can, 2 if none can.",
         ),
     ),
     Command(
@@ -407,7 +407,7 @@ COMMANDS: tuple[Command, ...] = (
             _RECURSIVE,
             advanced("--strict", help="exclude scans with coordinates that are NaN or infinite (default: remove the "
                      "triangles that use them, with a note)"),
-            _jobs("scans"),
+            _jobs_option("scans"),
         ),
         (
             "Writes NAME.corresponding.ply and NAME.correspond.json for each scan, and correspondence.json and "
@@ -459,10 +459,10 @@ COMMANDS: tuple[Command, ...] = (
         ),
         (
             "The meshes have the same vertices and triangles. Of a folder that correspond wrote, the surfaces in "
-            "correspondence are used; a folder of an unfinished run is refused. Surfaces whose unit differs from the "
+            "correspondence are used; a folder of an unfinished run is rejected. Surfaces whose unit differs from the "
             "majority are converted to the unit of the majority, which --unit sets; with --gauge form or --no-align "
-            "they are refused. With fewer than four meshes, --modes auto keeps all modes. Modes that result from "
-            "alignment or rounding alone are always left out, and counted.",
+            "they are rejected. With fewer than four meshes, --modes auto keeps all modes. Modes that result from "
+            "alignment or rounding alone are always omitted, and counted.",
         ),
     ),
     Command(
@@ -482,7 +482,7 @@ COMMANDS: tuple[Command, ...] = (
             advanced("--no-align", help="use the meshes in their pose, without alignment", source=QUALITY),
             advanced("--representation", source=QUALITY_TARGETS, field="representations", nargs="+",
                      choices=_REPRESENTATIONS, default=("vertices",)),
-            _jobs("folds"),
+            _jobs_option("folds"),
         ),
         (
             "Writes quality.json, and quality.png and quality.svg, which need the extra report. Of a folder with "
@@ -534,7 +534,7 @@ COMMANDS: tuple[Command, ...] = (
                      "NAME", "robust: pose and shape jointly, from distances in both directions; paper: the "
                      "paper's modified ICP", FIT),
             *_FIT_OPTIONS,
-            _jobs("scans"),
+            _jobs_option("scans"),
             advanced("--again", help="fit all scans again, also those with valid results", either="results"),
             advanced("--store",
                      help="write the results to few files (the default from 10,000 scans on, and in a folder "
@@ -561,7 +561,7 @@ COMMANDS: tuple[Command, ...] = (
         has_workers=True,
     ),
     Command(
-        "complete", "complete partial scans: the missing part with its uncertainty, and samples of the whole shape",
+        "complete", "complete partial scans: the missing part with its uncertainty, and samples of the complete shape",
         ("shapespace complete model.h5 broken.ply -o completed",
          "shapespace complete model.h5 scans -o completed --mirror combined --stl",
          "shapespace compare completed '~ group' -o compared"), "cli.answers:answer_complete",
@@ -582,10 +582,10 @@ COMMANDS: tuple[Command, ...] = (
         ),
         (
             "Writes for each scan NAME.ply, the completed surface with the vertices of the model and the property "
-            "observed, and NAME.samples.npz, samples of the whole shape in the same frame; completions.csv; "
+            "observed, and NAME.samples.npz, samples of the complete shape in the same frame; completions.csv; "
             "estimates.csv with intervals of volume, area and length; landmarks.csv; methods.txt, and the report. "
             "compare, regress, asymmetry and score read the folder, and use the samples as multiple imputations. A "
-            "scan whose fit is doubtful is refused, as its completion would look more certain than it is. The exit "
+            "scan whose fit is doubtful is rejected, as its completion would look more certain than it is. The exit "
             "code is 1 if some scans have no completion, 2 if none has.",
         ),
         settings=(_LANDMARK_STDDEV, setting("seed", "S", source=COMPLETION, parse=values.natural)),
@@ -624,7 +624,7 @@ COMMANDS: tuple[Command, ...] = (
         json=False,
     ),
     Command(
-        "studio", "do the whole work in the browser: scans, correspondence, model, fits, analyses",
+        "studio", "do the complete work in the browser: scans, correspondence, model, fits, analyses",
         ("shapespace studio teeth",), "cli.pages:studio",
         (
             basic("project", "PROJECT", "folder of the project, created if it is new or empty (default: a page with "
@@ -636,9 +636,9 @@ COMMANDS: tuple[Command, ...] = (
         ),
         (
             "The project's folder contains project.json, the scans (or references to them), and the results, which all "
-            "commands can read; history.sh computes them anew. The address that is printed contains a token, without "
-            "which nothing is answered. Ctrl-C ends the studio; commands that it started go on. Needs the extras view "
-            "and report.",
+            "commands can read; history.sh computes them again. The address that is printed contains a token, without "
+            "which nothing is answered. Ctrl-C ends the studio; commands that it started continue. Needs the extras "
+            "view and report.",
         ),
         json=False,
         defaults={"commands": lambda: summaries_and_options()},
@@ -671,8 +671,8 @@ COMMANDS: tuple[Command, ...] = (
             basic("--dimensions", "D", source=LANDMARKS_CONVERT, parse=values.positive),
         ),
         (
-            "Coordinates are exact. Prints what was scaled, taken as missing or left out. Sliders are written next to "
-            "OUT as geomorph reads them. Files of R need the extra r.",
+            "Coordinates are exact. Prints what was scaled, interpreted as missing or omitted. Sliders are written "
+            "next to OUT as geomorph reads them. Files of R need the extra r.",
         ),
     ),
     Command(
@@ -768,7 +768,7 @@ COMMANDS: tuple[Command, ...] = (
             advanced("--seed", "S", source=TRAIN),
         ),
         (
-            "Failed and doubtful fits and scans without a label are left out, and counted. The macro accuracy by "
+            "Failed and doubtful fits and scans without a label are excluded, and counted. The macro accuracy by "
             "cross-validation over subjects is printed. Needs the extra recognise.",
         ),
     ),
@@ -786,7 +786,7 @@ COMMANDS: tuple[Command, ...] = (
         ),
         (
             "The table has one row per scan: scan, status, prediction, the probability of each class as p_CLASS, "
-            "reason. Fits of another model than the classifier's are refused. The exit code is 1 if a scan has no "
+            "reason. Fits of another model than the classifier's are rejected. The exit code is 1 if a scan has no "
             "prediction, because its fit failed or its subject has no neutral face, and 2 if no scan has one.",
         ),
     ),
@@ -812,7 +812,7 @@ COMMANDS: tuple[Command, ...] = (
             basic("--model", "MODEL.h5", "shape model that is fitted to them", parse=Path),
             basic("--folds", "N", "folds of subjects, fewer for fewer subjects", STUDY, default=10,
                   parse=values.positive),
-            _jobs("fits"),
+            _jobs_option("fits"),
             _NO_OPEN,
         ),
         (
@@ -855,12 +855,12 @@ COMMANDS: tuple[Command, ...] = (
             replace(_DATA, help=_DATA.help.replace("a cohort file (.toml); ", "")),
             basic("-o --output", "FILE.toml", "the cohort file", parse=Path, required=True),
             _SHAPES,
-            *(replace(one, names=f"--{one.names}", setting=False, basic=one.names in _BASIC_OF_COHORT)
-              for one in COHORT_SETTINGS),
+            *(replace(option, names=f"--{option.names}", setting=False, basic=option.names in _BASIC_OF_COHORT)
+              for option in COHORT_SETTINGS),
         ),
         (
-            "The shapes are read once, so that what cannot be used is named now. Paths in the file are relative to it. "
-            "A question takes the file in place of a table, and --set changes one of its settings for one answer.",
+            "The shapes are read once, so that unusable data are reported at once. Paths in the file are relative to "
+            "it. A question takes the file in place of a table, and --set changes one of its settings for one answer.",
         ),
     ),
     Command(
@@ -896,7 +896,7 @@ COMMANDS: tuple[Command, ...] = (
             advanced("--variances", source=COMPARE),
             advanced("--bumps", "MM", source=COMPARE, field="bump_width_mm"),
         ),
-        settings=_settings(
+        settings=_question_settings(
             setting("error_permutation", source=COMPARE),
             setting("coding", source=COMPARE),
             setting("effect_size", source=COMPARE),
@@ -921,7 +921,7 @@ COMMANDS: tuple[Command, ...] = (
             "In the plot of the report a click, or the arrow keys, choose a place; the shape there is drawn next to "
             "the mean. Scores, loadings (change of each coordinate per unit of score) and eigenvalues are CSV tables.",
         ),
-        settings=_settings(),
+        settings=_question_settings(),
     ),
     *(_shape_test(test) for test in SHAPE_TESTS),
     Command(
@@ -939,7 +939,9 @@ COMMANDS: tuple[Command, ...] = (
             advanced("--rate", source=CHANGE),
             advanced("--permutations", "N", source=CHANGE, parse=values.integer),
         ),
-        settings=_settings(setting("seed", "S", source=CHANGE, parse=values.integer), without=("gauge", "unit")),
+        settings=_question_settings(
+            setting("seed", "S", source=CHANGE, parse=values.integer), without=("gauge", "unit")
+        ),
     ),
     Command(
         "asymmetry", "measure asymmetry: scores and maps, directional and fluctuating asymmetry",
@@ -950,13 +952,13 @@ COMMANDS: tuple[Command, ...] = (
             basic("--pairs",
                   "PAIRS.csv", "two columns of landmarks that mirror each other, by name or by number from 1; those in "
                   "no pair lie on the plane of symmetry; of surfaces: names of landmarks, or vertices from 0, those on "
-                  "the plane paired with themselves, others left out (default: found on the mean)",
+                  "the plane paired with themselves, others excluded (default: found on the mean)",
                   parse=Path),
             basic("--side", "COLUMN", source=ASYMMETRY),
             advanced("--degrees-of-freedom", source=ASYMMETRY),
             advanced("--permutations", "P", source=ASYMMETRY, parse=values.integer),
         ),
-        settings=_settings(setting("seed", "S", source=ASYMMETRY, parse=values.integer)),
+        settings=_question_settings(setting("seed", "S", source=ASYMMETRY, parse=values.integer)),
     ),
     Command(
         "regress", "predict a number, such as age, from shape, or the mean shape along a number, with intervals",
@@ -978,10 +980,10 @@ COMMANDS: tuple[Command, ...] = (
             advanced("--permutations", "P", "permutations for p, 0 for none (default: 199; with --along 1000)",
                      parse=values.integer),
         ),
-        settings=_settings(
+        settings=_question_settings(
             setting("curve", source=ALONG, default=None),
-            setting("hold", "COLUMN=VALUE", "of --along: value of another column, such as sex=female; commas part "
-                    "several (default: numbers at their mean, and classes count alike)", parse=values.words),
+            setting("hold", "COLUMN=VALUE", "of --along: value of another column, such as sex=female; separate several "
+                    "by commas (default: numbers at their mean, and classes count alike)", parse=values.words),
             setting("folds", "K", source=REGRESS, parse=values.integer),
             setting("level", "L", "coverage of intervals (default: 0.9; with --along 0.95)", dest="confidence",
                     parse=values.number),
@@ -998,7 +1000,7 @@ COMMANDS: tuple[Command, ...] = (
             basic("--modes", "N", source=SCORE, parse=values.integer),
             basic("--nearest", "N", source=SCORE, parse=values.integer),
         ),
-        settings=_settings(setting("seed", "S", source=SCORE, parse=values.integer)),
+        settings=_question_settings(setting("seed", "S", source=SCORE, parse=values.integer)),
     ),
     Command(
         "export", "export fits as single files or one table, or any cohort to geomorph, MorphoJ, TPS or CSV",
@@ -1022,7 +1024,7 @@ COMMANDS: tuple[Command, ...] = (
             "the columns of coefficients.csv, the rows of each shard in turn; in MATLAB it is a struct fits with b, "
             "z, b_stddev, scan and so on. The exit code is 1 if some of the fits cannot be read, 2 if none can.",
         ),
-        settings=_settings(),
+        settings=_question_settings(),
     ),
     Command(
         "convert", "convert a shape model from or to the format of another tool",
@@ -1035,14 +1037,14 @@ COMMANDS: tuple[Command, ...] = (
             basic("--unit", "UNIT", "unit of IN, if its format does not contain it (default: mm)", choices=_UNITS),
             advanced("--expressions", "FILE.bin", source=CONVERT),
         ),
-        ("Prints what was kept, changed and left out. Training shapes are always left out.",),
+        ("Prints what was kept, changed and omitted. Training shapes are always omitted.",),
     ),
     Command(
         "cache", "print the folder and size of the cache, or clear it", ("shapespace cache --clear",),
         "commands.cache:cache",
         (basic("--clear", help="remove all entries; fits compute them again"),),
         (
-            "The cache holds residual modes of the models that were fitted. SHAPESPACE_CACHE names another folder; "
+            "The cache contains residual modes of the models that were fitted. SHAPESPACE_CACHE sets another folder; "
             "SHAPESPACE_KEEP=no turns the cache off.",
         ),
     ),

@@ -25,15 +25,15 @@ def run_command(name: str, arguments: argparse.Namespace) -> int:
     if arguments.command.has_workers:
         _start_workers(arguments)
     function = resolve_name(f"shapespace.{name}")
-    outcome: Outcome | int = function(**_values(arguments, function))
+    outcome: Outcome | int = function(**_parameter_values(arguments, function))
     return outcome if isinstance(outcome, int) else show_outcome(outcome, as_json=arguments.json)
 
 
-def _values(arguments: argparse.Namespace, function: Callable[..., object]) -> dict[str, Any]:
+def _parameter_values(arguments: argparse.Namespace, function: Callable[..., object]) -> dict[str, Any]:
     """Return the values of the parameters of a function.
 
-    A configuration class is made of its options, `say` prints messages, `arguments` are all arguments, and other
-    parameters have the names of options.
+    A parameter of a configuration class is an instance made from its options, that for messages is `printing.warn`,
+    `arguments` are all arguments, and other parameters have the names of options.
     """
     kinds: dict[str, type[Any]] = get_type_hints(function)
     values = {"say": warn, "arguments": arguments, **vars(arguments), **given(arguments, function)}
@@ -43,7 +43,7 @@ def _values(arguments: argparse.Namespace, function: Callable[..., object]) -> d
 
 
 def _start_workers(arguments: argparse.Namespace) -> None:
-    """Load the code of the workers while this process loads its own: half of the time that many scans take to start."""
+    """Load the code of the workers while this process loads its own, which takes half of the start of many scans."""
     one = len(arguments.scans) == 1 and Path(arguments.scans[0]).is_file()
     if not one and arguments.jobs != 1 and arguments.executor == "local":
         from shapespace.batch.workers import start_loading

@@ -1,4 +1,4 @@
-"""Forms of the commands for the studio, made of the table of commands."""
+"""Forms of the commands for the studio, made from the table of commands."""
 
 from __future__ import annotations
 
@@ -48,31 +48,31 @@ def forms(commands: Mapping[str, tuple[str, Sequence[Option]]]) -> dict[str, dic
     made: dict[str, dict[str, Any]] = {}
     for kind, first in _FIRST.items():
         command = _KINDS.get(kind, kind)
-        made[kind] = {"command": tuple(command.split()), **_form(*commands[command], first)}
+        made[kind] = {"command": tuple(command.split()), **_make_form(*commands[command], first)}
     made["convert"]["options"][0] |= {"kind": "choice", "choices": list(MODEL_FORMATS)}
     made["score"]["options"][0] |= {"kind": "class", "help": "class that the others are compared with"}
     return made
 
 
-def _form(summary: str, options: Sequence[Option], first: tuple[str, ...]) -> dict[str, Any]:
+def _make_form(summary: str, options: Sequence[Option], first: tuple[str, ...]) -> dict[str, Any]:
     order = {flag: place for place, flag in enumerate(first)}
     offered = [option for option in options if not option.is_positional or option.metavar == "FORMULA"]
-    described = [_described(option, visible=_flag(option) in order) for option in offered]
+    described = [_describe_option(option, visible=_page_name(option) in order) for option in offered]
     described = [option for option in described if option["flag"] not in _FILES]
     described.sort(key=lambda one: order.get(one["flag"], len(order)))
     return {"summary": summary, "options": described}
 
 
-def _flag(option: Option) -> str:
+def _page_name(option: Option) -> str:
     """Return the name of an option on the page, also of a setting and of a formula."""
     return f"--{option.names.replace('_', '-')}" if option.setting or option.is_positional else option.spellings[-1]
 
 
-def _described(option: Option, *, visible: bool) -> dict[str, Any]:
+def _describe_option(option: Option, *, visible: bool) -> dict[str, Any]:
     choices = list(option.accepted) or (["yes", "no"] if option.value_name == "yes|no" else [])
     argument = f"--set {option.names}" if option.setting else "" if option.is_positional else option.spellings[-1]
     return {
-        "flag": _flag(option), "argument": argument, "help": option.text.replace("`", ""),
+        "flag": _page_name(option), "argument": argument, "help": option.text.replace("`", ""),
         "kind": "choice" if choices else _kind(option), "choices": choices,
         "initial": option.initial_text or None, "visible": visible,
         "required": (option.required and not option.either) or option.names in ("formula", "--to"),

@@ -1,7 +1,7 @@
 """Options of commands, generated from the configuration classes and functions that the Python interface uses.
 
-A field's help, type, choices and default are read from the source text of its class, not from the class itself: to
-import the modules of the configuration classes takes seconds, and `--help` must take a fraction of one.
+The help, type, choices and default of a field are read from the source text of its class, not from the class itself:
+importing the modules of the configuration classes takes seconds, and `--help` must take a fraction of a second.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from shapespace.cli import values
 Container: TypeAlias = argparse._ActionsContainer  # pyright: ignore[reportPrivateUsage]
 """A parser, or a group of its options."""
 NO_DEFAULT = argparse.SUPPRESS
-"""Default of a field whose value is not a literal: the class or the function itself sets it."""
+"""Default of a field whose value is not a literal: the class or the function sets it."""
 _PARSERS: dict[str, Callable[[str], Any]] = {
     "int": values.natural,
     "float": values.number,
@@ -40,10 +40,10 @@ class Field:
     """A field of a configuration class, or a parameter of a function.
 
     Args:
-        help: its text in the docstring.
-        kinds: the types of its annotation, without None.
-        choices: the values of a `Literal`, else empty.
-        default: the default if it is a literal, None without one, else `NO_DEFAULT`.
+        help: text of the field in the docstring.
+        kinds: types of its annotation, without None.
+        choices: values of a `Literal`, else empty.
+        default: the default if it is a literal, None without a default, else `NO_DEFAULT`.
     """
 
     help: str
@@ -57,8 +57,8 @@ class Source:
     """A configuration class or a function whose fields or parameters are options.
 
     Args:
-        module: its module, without `shapespace.`.
-        name: its name there.
+        module: module of the class or function, without `shapespace.`.
+        name: name of the class or function in its module.
     """
 
     module: str
@@ -66,7 +66,7 @@ class Source:
 
     def field(self, name: str) -> Field:
         """Return a field by its name."""
-        return _fields(self)[name]
+        return _read_fields(self)[name]
 
 
 @dataclass(frozen=True)
@@ -74,17 +74,17 @@ class Option:
     """An argument of a command: positional, an option with a value, or a flag.
 
     Args:
-        names: the spellings, such as `-o --output`; one word without dashes is a positional argument.
-        metavar: the name of its value; empty for a flag, or for a choice.
-        help: empty for the text of the field.
-        source: the class or function that takes the value; None for an option of the command line alone.
-        field: the field of `source`; empty for the long spelling in the form of a field.
+        names: spellings, such as `-o --output`; one word without dashes is a positional argument.
+        metavar: name of its value; empty for a flag, or for a choice.
+        help: help text; empty for the text of the field.
+        source: class or function that takes the value; None for an option of the command line alone.
+        field: field of `source`; empty for the long spelling in the form of a field.
         basic: whether `--help` lists it.
-        parse: parser of the value; None for the one of the field's type.
+        parse: parser of the value; None for the parser of the field's type.
         choices: accepted values; empty for those of the field.
-        default: `NO_DEFAULT` for that of the field.
+        default: default; `NO_DEFAULT` for the default of the field.
         required: whether it must be given.
-        nargs: as of argparse.
+        nargs: number of values, see `nargs` of argparse.
         repeat: whether it can be given several times.
         dest: attribute of the parsed arguments; empty for the long spelling.
         either: name of a group of options of which only one can be given; one must, if they are `required`.
@@ -130,7 +130,7 @@ class Option:
 
     @property
     def negates(self) -> bool:
-        """Whether it is a flag that makes a field false."""
+        """Whether it is a flag that sets a field to False."""
         return self.attribute.startswith("no_") and self.source is not None
 
     @property
@@ -165,7 +165,7 @@ class Option:
 
     @property
     def initial_text(self) -> str:
-        """Its value if it is not given, as text; empty for a flag, and where the class or the function sets it."""
+        """Its value if it is not given, as text; empty for a flag, and if the class or the function sets it."""
         initial = self.initial
         if self.is_flag or initial in (NO_DEFAULT, None, "", (), []):
             return ""
@@ -177,7 +177,7 @@ class Option:
         return self.source.field(self.field_name) if self.source else None
 
     def add_to(self, group: Container, *, in_help: bool) -> None:
-        """Add it to a parser or a group of one; `shown` is whether its help is."""
+        """Add it to a parser or a group of a parser; `in_help` is whether its help text is shown."""
         text = self.text.replace("%", "%%").replace("`", "")
         keywords: dict[str, Any] = {"help": text if in_help else argparse.SUPPRESS}
         if self.is_flag:
@@ -191,20 +191,20 @@ class Option:
             keywords["nargs"] = self.nargs
         if self.accepted:
             keywords["choices"] = self.accepted
-        keywords |= {"type": self.parse or self._parser(), "default": self.initial}
+        keywords |= {"type": self.parse or self._find_parser(), "default": self.initial}
         group.add_argument(*self.spellings, metavar=self.metavar or None, **keywords)
 
     def parse_value(self, text: str) -> Any:
         """Return the value of a text.
 
         Raises:
-            ArgumentTypeError: the text is no value of this option.
+            ArgumentTypeError: the option does not accept the text.
         """
         if self.accepted and text not in self.accepted:
             raise argparse.ArgumentTypeError(f"is {text!r}; choose from {', '.join(self.accepted)}")
-        return (self.parse or self._parser())(text)
+        return (self.parse or self._find_parser())(text)
 
-    def _parser(self) -> Callable[[str], Any]:
+    def _find_parser(self) -> Callable[[str], Any]:
         kinds = self._field.kinds if self._field else ()
         return next((_PARSERS[kind] for kind in kinds if kind in _PARSERS), str)
 
@@ -222,7 +222,7 @@ def apply_settings(arguments: argparse.Namespace, settings: Sequence[Option]) ->
 
     Args:
         arguments: parsed arguments; `chosen` becomes the names of the settings that are given.
-        settings: those of the command.
+        settings: settings of the command.
 
     Raises:
         ArgumentTypeError: a setting that the command does not have, or a value that it does not accept.
@@ -238,7 +238,9 @@ def apply_settings(arguments: argparse.Namespace, settings: Sequence[Option]) ->
             raise argparse.ArgumentTypeError(f"argument --set: {text!r} is not NAME=VALUE")
         if name not in known:
             options: Sequence[Option] = arguments.command.options
-            spelling = next((one.spellings[-1] for one in options if one.attribute == name.replace("-", "_")), "")
+            spelling = next(
+                (option.spellings[-1] for option in options if option.attribute == name.replace("-", "_")), ""
+            )
             if spelling.startswith("--"):
                 raise argparse.ArgumentTypeError(f"argument --set: {name} is an option; write {spelling} {value}")
             nearest = difflib.get_close_matches(name, list(known), 1) or sorted(known)
@@ -266,7 +268,7 @@ def given(arguments: argparse.Namespace, taker: Callable[..., Any], **instead: A
         if option.source is not None and option.source.name == taker.__name__ and hasattr(arguments, option.attribute):
             value = getattr(arguments, option.attribute)
             if option.is_flag and not value:
-                continue  # the class sets its default, which may be to decide itself
+                continue  # the class sets its default, which may be automatic
             chosen[option.field_name] = not value if option.negates else value
     return {**chosen, **instead}
 
@@ -275,21 +277,21 @@ def given(arguments: argparse.Namespace, taker: Callable[..., Any], **instead: A
 
 
 @cache
-def _tree(module: str) -> ast.Module:
+def _parse_module(module: str) -> ast.Module:
     source = pkgutil.get_data("shapespace", f"{module.replace('.', '/')}.py")
     assert source is not None, module
     return ast.parse(source)
 
 
 @cache
-def _fields(source: Source) -> Mapping[str, Field]:
+def _read_fields(source: Source) -> Mapping[str, Field]:
     """Return the fields of a class, or the parameters of a function, by name."""
     [node] = [
         node
-        for node in _tree(source.module).body
+        for node in _parse_module(source.module).body
         if isinstance(node, ast.ClassDef | ast.FunctionDef) and node.name == source.name
     ]
-    texts = _texts(ast.get_docstring(node) or "")
+    texts = _read_texts(ast.get_docstring(node) or "")
     definitions: dict[str, tuple[ast.expr | None, ast.expr | None]] = {}
     if isinstance(node, ast.ClassDef):
         for part in node.body:
@@ -299,29 +301,30 @@ def _fields(source: Source) -> Mapping[str, Field]:
         plain, keyword = node.args.args, node.args.kwonlyargs
         defaults = [*[None] * (len(plain) - len(node.args.defaults)), *node.args.defaults, *node.args.kw_defaults]
         definitions = {
-            one.arg: (one.annotation, default) for one, default in zip([*plain, *keyword], defaults, strict=True)
+            parameter.arg: (parameter.annotation, default)
+            for parameter, default in zip([*plain, *keyword], defaults, strict=True)
         }
     return {
-        name: Field(texts.get(name, ""), *_kinds(source.module, annotation), _literal(default))
+        name: Field(texts.get(name, ""), *_types_and_choices(source.module, annotation), _evaluate_literal(default))
         for name, (annotation, default) in definitions.items()
     }
 
 
-def _texts(docstring: str) -> dict[str, str]:
+def _read_texts(docstring: str) -> dict[str, str]:
     """Return the texts of a docstring's section Args by name."""
     section = re.search(r"^Args:\n(.*?)(?=^\S|\Z)", docstring, re.MULTILINE | re.DOTALL)
     entries = re.findall(r"^    (\w+): (.*?)(?=^    \w|\Z)", section[1] if section else "", re.MULTILINE | re.DOTALL)
     return {name: " ".join(text.split()).removesuffix(".") for name, text in entries}
 
 
-def _literal(node: ast.expr | None) -> Any:
+def _evaluate_literal(node: ast.expr | None) -> Any:
     try:
         return None if node is None else ast.literal_eval(node)
     except ValueError:
         return NO_DEFAULT
 
 
-def _kinds(module: str, annotation: ast.expr | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _types_and_choices(module: str, annotation: ast.expr | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the types of an annotation, and the values of a `Literal` in it."""
     parts = [annotation]
     while isinstance(parts[0], ast.BinOp):
@@ -329,7 +332,7 @@ def _kinds(module: str, annotation: ast.expr | None) -> tuple[tuple[str, ...], t
     kinds = [ast.unparse(part) for part in parts if part is not None]
     choices: tuple[str, ...] = ()
     for part in parts:
-        literal = _alias(module, part.id) if isinstance(part, ast.Name) else part
+        literal = _resolve_alias(module, part.id) if isinstance(part, ast.Name) else part
         if isinstance(literal, ast.Subscript) and ast.unparse(literal.value) == "Literal":
             value = ast.literal_eval(literal.slice)
             choices += value if isinstance(value, tuple) else (value,)
@@ -337,12 +340,12 @@ def _kinds(module: str, annotation: ast.expr | None) -> tuple[tuple[str, ...], t
 
 
 @cache
-def _alias(module: str, name: str) -> ast.expr | None:
-    """Return what a name stands for in a module, followed through its imports from this package."""
-    for node in ast.walk(_tree(module)):
+def _resolve_alias(module: str, name: str) -> ast.expr | None:
+    """Return the definition of a name in a module, followed through its imports from this package."""
+    for node in ast.walk(_parse_module(module)):
         if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.target.id == name:
             return node.value
         if isinstance(node, ast.ImportFrom) and name in [imported.name for imported in node.names]:
             package, _, home = (node.module or "").partition(".")
-            return _alias(home, name) if package == "shapespace" else None
+            return _resolve_alias(home, name) if package == "shapespace" else None
     return None

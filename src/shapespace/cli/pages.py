@@ -1,4 +1,4 @@
-"""The commands that go on in the browser until they are stopped."""
+"""The commands that run in the browser until they are stopped."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def view(arguments: argparse.Namespace) -> int:
 
 
 def studio(arguments: argparse.Namespace) -> int:
-    """Do the whole work in the browser."""
+    """Run the studio in the browser."""
     options = given(arguments, serve_studio)
     serve_studio(arguments.project, forms(arguments.commands()), **options, open_browser=not arguments.no_open, say=now)
     return 0

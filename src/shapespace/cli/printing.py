@@ -1,4 +1,4 @@
-"""How the command line speaks: sentences on standard error, lines and JSON on standard output."""
+"""Output of the command line: sentences on standard error, lines and JSON on standard output."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from shapespace.commands.outcome import Aside, Outcome, plain_value
 
 def say(sentence: str) -> None:
     """Print a sentence on standard error."""
-    print(_visible(sentence), file=sys.stderr)
+    print(_escape_control(sentence), file=sys.stderr)
 
 
 def warn(sentence: str) -> None:
-    """Print a sentence on standard error that begins with who says it."""
+    """Print a sentence on standard error, with the name of the program."""
     say(f"shapespace: {sentence}")
 
 
 def show(line: str) -> None:
     """Print a line on standard output."""
-    print(_visible(line))
+    print(_escape_control(line))
 
 
 def now(line: str) -> None:
-    """Print a line at once, for a command that goes on."""
+    """Print a line at once, for a command that continues."""
     show(line)
     sys.stdout.flush()
 
@@ -48,6 +48,6 @@ def show_outcome(outcome: Outcome, *, as_json: bool) -> int:
     return outcome.exit_code
 
 
-def _visible(line: str) -> str:
-    """Return `line` with control characters as escapes: a file's name may hold line breaks and terminal codes."""
+def _escape_control(line: str) -> str:
+    """Return `line` with control characters as escapes: names of files may contain line breaks and terminal codes."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in line)

@@ -1,4 +1,4 @@
-"""Parsers of the values of options: each returns the value, or raises an error that says what is accepted."""
+"""Parsers of the values of options: each returns the value, or raises an error with the accepted values."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from collections.abc import Callable
 from pathlib import Path
 
 _LARGEST = 2**63
-"""Larger whole numbers are none of JSON, in which all settings are written."""
+"""Bound of integers: JSON, in which all settings are written, has no larger ones."""
 
 
 def integer(text: str) -> int:
-    """Return a whole number of any sign."""
+    """Return an integer of any sign."""
     try:
         value = int(text)
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from None
+        raise argparse.ArgumentTypeError(f"{text!r} is not an integer") from None
     if abs(value) >= _LARGEST:
         raise argparse.ArgumentTypeError(f"must be below {_LARGEST}")
     return value
 
 
 def natural(text: str) -> int:
-    """Return a whole number of 0 or more."""
+    """Return an integer of 0 or more."""
     value = integer(text)
     if value < 0:
         raise argparse.ArgumentTypeError("must not be negative")
@@ -31,7 +31,7 @@ def natural(text: str) -> int:
 
 
 def positive(text: str) -> int:
-    """Return a whole number of 1 or more."""
+    """Return an integer of 1 or more."""
     value = natural(text)
     if value == 0:
         raise argparse.ArgumentTypeError("must be at least 1")
@@ -64,20 +64,20 @@ def share(text: str) -> float:
 
 def seconds(text: str) -> float:
     """Return a time in seconds above 0."""
-    return _number(text, lambda value: 0 < value < float("inf"), "seconds above 0")
+    return _parse_number(text, lambda value: 0 < value < float("inf"), "seconds above 0")
 
 
 def std_mm(text: str) -> float:
     """Return a standard deviation in mm; infinity is accepted."""
-    return _number(text, lambda value: value > 0, "a number of millimetres above 0, or inf")
+    return _parse_number(text, lambda value: value > 0, "a number of millimetres above 0, or inf")
 
 
 def smoothing(text: str) -> float:
     """Return a standard deviation in voxels, from 0 to 10."""
-    return _number(text, lambda value: 0 <= value <= 10, "a number from 0 to 10")
+    return _parse_number(text, lambda value: 0 <= value <= 10, "a number from 0 to 10")
 
 
-def _number(text: str, accepts: Callable[[float], bool], accepted: str) -> float:
+def _parse_number(text: str, accepts: Callable[[float], bool], accepted: str) -> float:
     try:
         value = float(text)
     except ValueError:
@@ -122,7 +122,7 @@ def control_points(text: str) -> tuple[int, int]:
     """Return the counts of MxN."""
     counts = text.lower().split("x")
     if len(counts) != 2 or not all(count.isascii() and count.isdigit() and len(count) < 4 for count in counts):
-        raise argparse.ArgumentTypeError(f"must be two whole numbers such as 24x24, not {text!r}")
+        raise argparse.ArgumentTypeError(f"must be two integers such as 24x24, not {text!r}")
     return int(counts[0]), int(counts[1])
 
 
@@ -135,7 +135,7 @@ def error_term(text: str) -> tuple[str, str]:
 
 
 def counts(text: str) -> tuple[int, ...]:
-    """Return whole numbers of 1 or more, separated by commas."""
+    """Return integers of 1 or more, separated by commas."""
     return tuple(positive(word) for word in words(text))
 
 

@@ -21,7 +21,7 @@ from shapespace.schemas import ReviewCode, ReviewReason
 from shapespace.types import MM_PER_UNIT, BoolArray, FloatArray, Mesh, Similarity, SurfaceLandmarks
 
 ANOTHER_SHAPE = 0.25
-"""The mean change of another object, as a share of its size."""
+"""Change of the template, as a share of its size, from which on it is another object."""
 _LISTED = 10  # names or notes in the notes, so that they stay readable
 
 
@@ -30,35 +30,36 @@ class Corresponding:
     """One scan after the last round.
 
     Args:
-        name: of the scan.
-        reason: why it is excluded; empty where it is not.
+        name: name of the scan.
+        reason: why the scan is excluded; empty if it is not.
         status: converged, doubtful or excluded.
-        probability: that the surface is right, by its evidence; not-a-number if excluded.
-        doubt: why it is doubtful; empty where it is not.
-        evidence: what the shapes of the others say of the surface; None if excluded.
-        vertices: (V, 3) in the scan's own frame and unit, finite everywhere: where the scan shows nothing they are
-            estimates, the conditional means given the observed vertices; None if excluded.
-        T_scan_template: to the scan's own frame, or to that of its mirror image; None where no pose was found.
+        probability: probability that the surface is right, from its evidence; not-a-number if excluded.
+        doubt: why the scan is doubtful; empty if it is not.
+        evidence: comparison of the surface with the shapes of the other scans; None if excluded.
+        vertices: (V, 3) vertices in the scan's own frame and unit, finite everywhere: where the scan shows nothing they
+            are estimates, the conditional means given the observed vertices; None if excluded.
+        T_scan_template: similarity from the template's frame to the scan's own frame, or to that of its mirror image;
+            None if no pose was found.
         mirrored: whether the scan is a mirror image of the majority; `vertices` are in its own frame nevertheless.
         seen: share of the template's vertices that the scan observes.
         covered: share of the scan that the template covers.
         distance: (4,) mean, 95 %, 99 % and largest distance both ways over the overlap, in the scan's unit.
-        moved: RMS by which its vertices moved in each round, shares of its size.
+        moved: RMS movement of its vertices in each round, shares of its size.
         seconds: CPU time of each round.
-        landmarks: RMS distance of the scan's landmarks from their places on the surface, in the scan's unit;
-            not-a-number where it has none.
+        landmarks: RMS distance of the scan's landmarks from their positions on the surface, in the scan's unit;
+            not-a-number without landmarks.
         observed: (V,) bool, False where `vertices` are estimates; None if excluded.
         position_std: (V,) standard deviation of each vertex's position in any direction along the surface, in the
             scan's unit: with 90 % probability the position is within 2.15 times it; None if excluded.
-        measures: of the quality of the surface; None if excluded.
+        measures: measures of the quality of the surface; None if excluded.
         review: reasons to review the surface, in addition to `doubt`, by its measures; the most unusual first. Empty
             for scans that were added to a finished correspondence without the results of its scans.
-        notes: sentences on the repairs of the scan and on its landmarks, such as that they were turned by a half turn,
-            on copies of other scans, and on odd sizes and surfaces.
-        scale: size beside the usual one, units distinguished; not-a-number if excluded.
-        unit_ratio: how many times as large as in the unit of most scans its coordinates are, such as 0.001 for metres
+        notes: sentences on the repairs of the scan and on its landmarks, such as that they were rotated by a half turn,
+            on copies of other scans, and on unusual sizes and surfaces.
+        scale: size relative to the usual size, with units converted; not-a-number if excluded.
+        unit_ratio: ratio of its unit to the unit of most scans, in terms of coordinates, such as 0.001 for metres
             among millimetres.
-        area_share: area of the surface beside that of the scan; None if excluded, and for points.
+        area_share: ratio of the area of the surface to that of the scan; None if excluded, and for points.
 
     Example:
         >>> correspondence = ss.correspond(meshes[:3], ss.CorrespondConfig(vertices=200, rounds=1, mirror="never"))
@@ -93,12 +94,12 @@ class Corresponding:
     __repr__ = short_repr
 
     def noting(self, *sentences: str) -> Corresponding:
-        """Return it with further notes."""
+        """Return the scan with further notes."""
         return replace(self, notes=tuple(dict.fromkeys([*self.notes, *sentences])))
 
     @property
     def review_codes(self) -> list[ReviewCode]:
-        """Why the surface needs review; empty if it does not."""
+        """Codes of the reasons to review the surface; empty if it needs no review."""
         return [*(["doubtful"] if self.doubt else []), *(reason.code for reason in self.review)]
 
 
@@ -107,16 +108,16 @@ class Correspondence:
     """Scans in correspondence.
 
     Args:
-        template: the mean shape of the last round, in mm of `SIZE`, with the landmarks that scans have.
-        scans: in the order given.
-        why: where the first template came from, in a sentence.
+        template: mean shape of the last round, in mm of `SIZE`, with the landmarks of the scans.
+        scans: results of the scans, in the given order.
+        why: origin of the first template, in a sentence.
         moved: RMS movement in each round, share of the size.
-        landmarks: the landmarks that scans have, on each of the surfaces.
+        landmarks: landmarks of the scans, on each of the surfaces.
         sides_decided: whether scans could be distinguished from their mirror images; False for a symmetric object,
-            and where they were not compared.
-        groups: names of the scans in correspondence, then of those of each other kind of object; empty where all are of
+            and if they were not compared.
+        groups: names of the scans in correspondence, then of those of each other kind of object; empty if all are of
             one kind.
-        given: the template or model that was given, as a subject of a sentence; empty where there is none.
+        given: the given template or model, as a subject of a sentence; empty if none was given.
 
     Example:
         >>> correspondence = ss.correspond(meshes[:3], ss.CorrespondConfig(vertices=200, rounds=1, mirror="never"))
@@ -140,17 +141,17 @@ class Correspondence:
 
     @property
     def is_of_another_kind(self) -> bool:
-        """Whether the first template, if it was given, is hardly an object of the kind of the scans."""
+        """Whether the first template, if it was given, is probably another object than the scans."""
         return bool(self.given) and self.moved[0] >= ANOTHER_SHAPE
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences on what should be known before the surfaces are used; all notes on a scan are with it."""
+        """Sentences to read before the surfaces are used; all notes on a scan are with the scan."""
         notes: list[str] = []
         if self.is_of_another_kind:
             notes.append(
                 f"{self.given} had to change by {100 * self.moved[0]:.0f} % of its size to become these scans, so it "
-                "is hardly an object of their kind; look at the surfaces, or leave it out."
+                "is probably another kind of object; inspect the surfaces, or omit it."
             )
         if mirrored := [scan.name for scan in self.scans if scan.mirrored]:
             of = "scan is a mirror image" if len(mirrored) == 1 else "scans are mirror images"
@@ -176,7 +177,7 @@ class Correspondence:
         """Return the complete surfaces of scans that are not excluded, in their own frames, with `Mesh.observed`.
 
         They have the landmarks in whose triangles all vertices are observed. Surfaces of mirrored scans are reflected
-        at the plane x = 0 of their frame, so that all are of one side.
+        at the plane x = 0 of their frame, so that all have the same side.
         """
         return [
             self._mesh(scan, scan.vertices * (FLIP if scan.mirrored else 1.0))
@@ -194,16 +195,16 @@ class Correspondence:
 
 
 _EQUAL = 1e-4
-"""RMS distance, as a share of the size: coordinates stored as float32 far from the origin are no finer."""
+"""RMS distance, as a share of the size: the precision of coordinates stored as float32 far from the origin."""
 _LEAST_RATIO = 8.0
-"""Objects of one kind differ in size by less, and so units by more."""
+"""Ratio of sizes that two objects of one kind do not reach, so that a larger ratio is a ratio of units."""
 _UNITS = np.array(list(MM_PER_UNIT.values()))
 _RATIOS = np.unique((_UNITS[:, None] / _UNITS).ravel())
 _RATIOS = _RATIOS[(_RATIOS == 1.0) | (np.abs(np.log(_RATIOS)) > np.log(_LEAST_RATIO))]
 
 
 def copies(scans: Sequence[Mesh]) -> dict[int, int]:
-    """Return which of `scans` are earlier ones again, in any pose and size: the number of each, and of the first."""
+    """Return scans that are copies of earlier ones, in any pose and size: index of the copy -> index of the first."""
     first: dict[object, list[int]] = {}
     copy_of: dict[int, int] = {}
     for i, scan in enumerate(scans):
@@ -216,11 +217,11 @@ def copies(scans: Sequence[Mesh]) -> dict[int, int]:
     return copy_of
 
 
-def _equal(one: Mesh, other: Mesh) -> bool:
+def _equal(scan: Mesh, other: Mesh) -> bool:
     try:
-        moved = fit_similarity(one.vertices, other.vertices).apply(one.vertices)
+        moved = fit_similarity(scan.vertices, other.vertices).apply(scan.vertices)
     except InputError:
-        return np.array_equal(one.vertices, other.vertices)
+        return np.array_equal(scan.vertices, other.vertices)
     rms = np.sqrt(((moved - other.vertices) ** 2).sum(axis=1).mean())
     return bool(rms < _EQUAL * rms_size(other.vertices))
 
@@ -229,15 +230,15 @@ def unit_ratios(scales: Sequence[float]) -> tuple[FloatArray, FloatArray]:
     """Return sizes and units relative to those of most scans.
 
     Args:
-        scales: (N,) of scans relative to one template.
+        scales: (N,) sizes of scans relative to one template.
 
     Returns:
-        (N,) sizes relative to the median of most scans, in one unit, and (N,) how many times as large as in the unit of
-        most the coordinates are, such as 0.001 for metres among millimetres; 1 for most.
+        (N,) sizes relative to the median of most scans, in one unit, and (N,) ratios of the unit to that of most scans,
+        in terms of coordinates, such as 0.001 for metres among millimetres; 1 for most.
     """
     logs = np.log(np.asarray(scales, dtype=np.float64))
     near = np.abs(logs[:, None] - logs) < 0.5 * np.log(_LEAST_RATIO)
-    # As many in one unit as in another: the finer one.
+    # If two units are equally frequent, the smaller unit counts as usual.
     most = max(range(len(logs)), key=lambda i: (int(near[i].sum()), logs[i]))
     relative = logs - np.median(logs[near[most]])
     ratios = _RATIOS[np.abs(relative[:, None] - np.log(_RATIOS)).argmin(axis=1)]
@@ -246,20 +247,20 @@ def unit_ratios(scales: Sequence[float]) -> tuple[FloatArray, FloatArray]:
 
 _OTHER_SIZE = 2.0  # ratio of sizes: beyond twice the median a scan is probably of another object or unit
 _ENOUGH_TO_COMPARE, _FAR = 4, 3.0
-"""Times the usual distance (95 % of both directions), sizes divided out."""
+"""Ratio to the usual distance (95 % of both directions), relative to size, above which a surface is unusual."""
 
 
 def judge_collection(
     scans: Sequence[Corresponding], settled: float, earlier: Sequence[Corresponding] = ()
 ) -> tuple[Corresponding, ...]:
-    """Return the scans with sizes and units, the reasons to review their surfaces, and notes on odd ones.
+    """Return the scans with sizes and units, the reasons to review their surfaces, and notes on unusual ones.
 
     Args:
-        scans: of one correspondence.
+        scans: scans of one correspondence.
         settled: movement below which a round is the last, share of the size.
-        earlier: judged scans that these are added to; none of them changes.
+        earlier: judged scans that these are added to; none of these changes.
     """
-    every = [*earlier, *_sized(scans, earlier)]
+    every = [*earlier, *_add_sizes(scans, earlier)]
     measured = [(k, scan.measures) for k, scan in enumerate(every) if scan.measures is not None]
     reasons = find_review_reasons([measures for _, measures in measured], settled)
     for (k, _), own in zip(measured, reasons, strict=True):
@@ -272,15 +273,15 @@ def judge_collection(
             for k in np.flatnonzero(alike & (far / np.nanmedian(far[alike]) > _FAR)).tolist():
                 times = far[k] / np.nanmedian(far[alike])
                 every[k] = every[k].noting(
-                    f"Its surface lies {times:.2g} times as far from it as is usual; look at it."
+                    f"Its surface lies {times:.2g} times the usual distance from it; inspect it."
                 )
     return tuple(every[len(earlier) :])
 
 
-def _sized(scans: Sequence[Corresponding], earlier: Sequence[Corresponding]) -> list[Corresponding]:
+def _add_sizes(scans: Sequence[Corresponding], earlier: Sequence[Corresponding]) -> list[Corresponding]:
     """Return the scans with size and unit relative to the others, or to the scans that they are added to."""
     own = {k: scan.T_scan_template.scale for k, scan in enumerate(scans) if scan.T_scan_template is not None}
-    usual = [one.T_scan_template.scale / one.unit_ratio for one in earlier if one.T_scan_template is not None]
+    usual = [scan.T_scan_template.scale / scan.unit_ratio for scan in earlier if scan.T_scan_template is not None]
     groups = [[k] for k in own] if usual else [list(own)]  # added scans do not depend on each other
     sized = list(scans)
     for group in groups if own else []:
@@ -289,6 +290,6 @@ def _sized(scans: Sequence[Corresponding], earlier: Sequence[Corresponding]) -> 
             sized[k] = replace(scans[k], scale=scale, unit_ratio=ratio)
             if not 1 / _OTHER_SIZE < scale < _OTHER_SIZE:
                 sized[k] = sized[k].noting(
-                    f"It is {scale:.2g} times as large as most; look whether it is the same kind of object."
+                    f"It is {scale:.2g} times as large as most; check whether it is the same kind of object."
                 )
     return sized

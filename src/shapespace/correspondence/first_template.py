@@ -1,4 +1,4 @@
-"""The template of the first round: a mesh that the user gives, the mean of a model, or one of the scans."""
+"""The template of the first round: a given mesh, the mean of a model, or one of the scans."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from shapespace.geometry.outer_surface import outer_surface
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh, Similarity
 
-_FEWEST_SHARE = 2 / 3  # of the requested vertices; with fewer, handles of the surface have hardly a vertex each
+_FEWEST_SHARE = 2 / 3  # share of the requested vertices; with fewer, handles of the surface have hardly a vertex each
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,11 +30,11 @@ class FirstTemplate:
 
     Args:
         mesh: the template, of the size `SIZE`, about the origin.
-        origin: where it comes from, in a sentence.
-        repaired: the scans that can be used, by their number.
-        broken: why the others cannot.
+        origin: origin of the template, in a sentence.
+        repaired: usable scans, by their number.
+        broken: reasons why the other scans are unusable.
         notes: sentences on the repairs of the scans and on their landmarks, by number.
-        guide: a model whose mean is the template, of the same size and place.
+        guide: a model whose mean is the template, of the same size and position.
     """
 
     mesh: Mesh
@@ -51,7 +51,7 @@ def first_template(
     config: CorrespondConfig,
     model: ShapeModel | None = None,
 ) -> FirstTemplate:
-    """Return the input of the first round: `template` as it is, the mean of `model`, or the scan nearest to the others.
+    """Return the input of the first round, from `template`, the mean of `model`, or the scan nearest to the others.
 
     Raises:
         InputError: fewer than two scans, scans that are all equal, both a template and a model, or an object without
@@ -65,7 +65,9 @@ def first_template(
     if not 0 < config.landmark_uncertainty < np.inf:
         raise InputError(f"Landmarks have an uncertainty above 0, not {config.landmark_uncertainty}; give another.")
     if template is not None and model is not None:
-        raise InputError("Both a template and a model are given, and the model's mean is a template; leave one out.")
+        raise InputError(
+            "Both a template and a model are given, and the model's mean is a template; omit template or model."
+        )
     repaired, broken, notes = repaired_scans(scans, config)
     if len(repaired) < FEWEST:
         raise InputError(f"Hardly any of the scans can be used: {'; '.join(broken.values())}")
@@ -86,18 +88,22 @@ def first_template(
     mesh = mesh.with_vertices(T.apply(mesh.vertices), {name: T.apply(point) for name, point in mesh.landmarks.items()})
     if contradicts_most(mesh, repaired.values(), config.landmark_uncertainty):
         mesh = mesh.with_vertices(mesh.vertices, {})
-        origin += " Its landmarks contradict those of most scans, so the first round goes without them."
-    return FirstTemplate(mesh, origin, repaired, broken, notes, None if model is None else _transformed(model, T))
+        origin += " Its landmarks contradict those of most scans, so the first round does not use them."
+    return FirstTemplate(mesh, origin, repaired, broken, notes, None if model is None else _transform_model(model, T))
 
 
 def usable_scan(scan: Mesh, *, strict: bool = False) -> tuple[Mesh, list[str]]:
     """Return the repaired scan with the landmarks near its surface, and sentences on repairs and landmarks.
 
     Raises:
-        MeshError: it cannot be used.
+        MeshError: the scan cannot be used.
     """
     mesh, findings = repair(scan, strict=strict)
-    notes = [f"{one.problem} {one.action}" for one in findings if one.level == "note" or NON_FINITE in one.problem]
+    notes = [
+        f"{finding.problem} {finding.action}"
+        for finding in findings
+        if finding.level == "note" or NON_FINITE in finding.problem
+    ]
     mesh, sentences = with_own_landmarks(mesh)
     far = far_landmarks(mesh, place_landmarks(mesh, mesh.landmarks)) if mesh.landmarks else []
     return mesh, [*notes, *sentences, *far]
@@ -106,7 +112,7 @@ def usable_scan(scan: Mesh, *, strict: bool = False) -> tuple[Mesh, list[str]]:
 def repaired_scans(
     scans: Sequence[Mesh], config: CorrespondConfig, first: int = 0
 ) -> tuple[dict[int, Mesh], dict[int, str], dict[int, list[str]]]:
-    """Return the scans that can be used, by number from `first` on, why the others cannot, and notes on scans."""
+    """Return the usable scans, by number from `first` on, why the others are not usable, and notes on scans."""
     repaired: dict[int, Mesh] = {}
     notes: dict[int, list[str]] = {}
     broken: dict[int, str] = {}
@@ -125,12 +131,12 @@ def repaired_scans(
 
 def _mean_of(model: ShapeModel) -> Mesh:
     if model.faces is None:
-        raise MeshError("The model has no triangles, and a template needs them; leave it out, or give another.")
+        raise MeshError("The model has no triangles, and a template needs them; omit it, or give another model.")
     return Mesh(model.mean_vertices, model.faces, model.landmarks.positions(model.mean_vertices), "mean")
 
 
 def _chosen_scan(scans: Mapping[int, Mesh], config: CorrespondConfig) -> tuple[Mesh, str]:
-    """Return the scan nearest to the others, meshed evenly, and why it is that one."""
+    """Return the scan nearest to the others, meshed evenly, and why it was chosen."""
     choice = choose_template(list(scans.values()), config.seed)
     chosen = scans[list(scans)[choice.index]]
     mesh = resample(clean_scan(chosen), config.vertices)
@@ -150,7 +156,7 @@ def _check_vertices(template: Mesh, wanted: int) -> None:
     Handles and holes take vertices: a closed surface of F triangles with g handles has F / 2 + 2 - 2 g.
 
     Raises:
-        InputError: it has fewer than two thirds of them.
+        InputError: it has fewer than two thirds of the requested vertices.
     """
     count = len(template.vertices)
     if count < _FEWEST_SHARE * wanted:
@@ -165,7 +171,7 @@ def _check_vertices(template: Mesh, wanted: int) -> None:
         )
 
 
-def _transformed(model: ShapeModel, T: Similarity) -> ShapeModel:
+def _transform_model(model: ShapeModel, T: Similarity) -> ShapeModel:
     """Return `model` with its frame moved by `T`, which does not rotate."""
     return ShapeModel(
         mean=T.apply(model.mean_vertices).ravel(),

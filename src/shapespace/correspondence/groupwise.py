@@ -1,11 +1,11 @@
-"""Raw scans to surfaces in correspondence, in rounds.
+"""Dense correspondence of raw scans, in rounds.
 
     round 1    the template is registered to each scan
     round k    the mean of round k - 1 is the template, and each registration begins at the leave-one-out prediction
 
-A scan that cannot be registered is excluded with a reason, and is tried again in the next round. What the rounds know
-is a `RegistrationState`; each step is a function of the problem and a state that returns a new state. Equations Cn are
-those of docs/correspondence.md.
+A scan that cannot be registered is excluded with a reason, and is tried again in the next round. The state between two
+rounds is a `RegistrationState`; each step is a function of the problem and a state that returns a new state. Equations
+Cn are those of docs/correspondence.md.
 """
 
 from __future__ import annotations
@@ -60,25 +60,25 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.types import ByteArray, FloatArray, IntArray, Mesh, Similarity, SurfaceLandmarks
 
 ENOUGH_TO_JUDGE, _ENOUGH_TO_PREDICT = 6, 4
-"""Scans: fewer do not determine the normal range of shapes; fewer do not predict another one."""
-_JUDGES = 40  # finished scans, at most, that an added one is compared with: time grows with their square
+"""Number of scans: fewer do not determine the normal range of shapes; fewer do not predict another scan."""
+_JUDGES = 40  # largest number of finished scans with which an added scan is compared: time grows with their square
 _PARTS = 4  # folds of the shapes: the pose model of a scan is built without it
 _WHOLE, _LEAST_SPREAD, _SIZE_UNSEEN = 0.9, 0.01, 0.3
-"""Scans that observe more than this share of the template determine the usual size; the least standard deviation of
-log sizes; and that of a scan's own log size for each share that is missing."""
-_CLEARLY_WORSE = 1.1  # ratio of the scores of the other side and a scan's own: beyond it the side is settled
+"""Share of the template that a scan of the usual size must observe; smallest standard deviation of log sizes; and
+standard deviation of a scan's own log size per missing share."""
+_CLEARLY_WORSE = 1.1  # ratio of the scores of the other side and a scan's own, beyond which the side is decided
 _RELIEF = 0.4
 """Log ratio of distances that an agreement of reliefs counts as: 0 left a scan of a simulated kind in a wrong pose, and
 with 1 the scans of another kind were no longer a group."""
 _FALLS_SHORT = 0.3  # agreement of a relief below the usual one, from which other poses and sides are registered too
 _AS_NEAR = 1.1  # ratio of distances up to which a registration from another scan of the subject is used
-_BENDS = 0.15  # share of bent scans from which the object is one that bends
+_BENDS = 0.15  # share of bent scans from which the object counts as one that bends
 _ANCHORS, _MOST_ANCHORS = 2, 6
-"""Scans that all others are compared with, in addition to the template; at most, until the sides are decided."""
+"""Number of scans with which all others are compared, besides the template, and its limit while sides are undecided."""
 
 
 Runner: TypeAlias = Callable[[RoundContext, Sequence[RegistrationTask]], Iterable[ScanRegistration]]
-"""Does the tasks of a round, here or elsewhere, and yields their registrations as they end, in any order."""
+"""Function that does the tasks of a round, in any process, and yields their registrations as they end, in any order."""
 
 
 def run_here(context: RoundContext, tasks: Sequence[RegistrationTask]) -> Iterable[ScanRegistration]:
@@ -96,21 +96,22 @@ def correspond(
     subjects: Sequence[str] = (),
     run: Runner = run_here,
 ) -> Correspondence:
-    """Bring raw `scans` into correspondence: any pose, size and triangles, holes allowed, no landmarks.
+    """Bring raw `scans` into correspondence: any pose, size and triangles, holes allowed, no landmarks required.
 
     Args:
-        scans: of one kind of object; landmarks that they have are soft constraints, but for those far off the scan.
-        config: how.
-        template: the surface of the first round, used as it is; None chooses a scan and meshes it evenly.
-        model: of such objects; its mean is the template, and the first round begins at its fit to each scan.
-        first: the result of `first_template` for these scans, where it was called already.
-        subjects: of the scans; scans of one subject are then registered from each other. Empty if unknown.
-        run: does the tasks of a round.
+        scans: scans of one kind of object; their landmarks are soft constraints, except those far off the scan.
+        config: settings.
+        template: surface of the first round, used unchanged; None chooses a scan and meshes it evenly.
+        model: shape model of such objects; its mean is the template, and the first round begins at its fit to each
+            scan.
+        first: result of `first_template` for these scans, if it is already known.
+        subjects: subject of each scan; scans of one subject are then registered from each other. Empty if unknown.
+        run: function that does the tasks of a round.
 
     Raises:
         InputError: fewer than two scans, scans that are all equal, too few that can be registered, or settings with
             which the first template has too few vertices, or the median surface more than 1 % of folded triangles.
-        MeshError: no scan can be a template, or the template is none.
+        MeshError: no scan can be a template, or the given template is unusable.
     """
     scans = list(as_meshes(scans, "correspond"))
     config = config or CorrespondConfig()
@@ -118,19 +119,21 @@ def correspond(
     if subjects and len(subjects) != len(scans):
         raise InputError(f"There are {len(subjects)} subjects for {len(scans)} scans; give one for each scan.")
     problem = replace(_Problem.of([scan.name for scan in scans], first, config), subjects=tuple(subjects))
-    problem, sides = _with_sides(problem, run, may_reflect=template is None and model is None)
+    problem, sides = _decide_sides(problem, run, may_reflect=template is None and model is None)
     state = _initial_state(problem, sides)
     for _ in range(config.rounds):
-        registrations = run(_context(problem, state), [_task(problem, state, i) for i in problem.first.repaired])
+        registrations = run(
+            _round_context(problem, state), [_make_task(problem, state, i) for i in problem.first.repaired]
+        )
         previous, state = state, _next_state(problem, state, registrations)
         if not previous.rounds and state.bends:
-            state = _with_sides_by_strain(problem, previous, state, run)
+            state = _decide_sides_by_strain(problem, previous, state, run)
         if subjects and not previous.rounds:
-            state = _registered_by_subject(problem, previous, state, run)
+            state = _register_by_subject(problem, previous, state, run)
         if state.rounds[-1].moved < config.settled:  # C17
             break
     given = template.name if template is not None else "" if model is None else "The model's mean"
-    result = _result(problem, state, _evidence(state), given)
+    result = _make_result(problem, state, _find_evidence(state), given)
     _check_folds(result, config)
     return result
 
@@ -153,16 +156,16 @@ def _check_folds(result: Correspondence, config: CorrespondConfig) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """What no round changes.
+    """Constants of all rounds.
 
     Args:
-        names: of all scans, also of those that cannot be used.
-        first: the first template, and the scans that can be used.
-        config: of the correspondence.
-        harmonics: of the first template, used on every later one.
-        comparisons: poses of scans in relation to the anchors.
+        names: names of all scans, including unusable ones.
+        first: the first template, and the usable scans.
+        config: settings of the correspondence.
+        harmonics: harmonics of the first template, used on every later one.
+        comparisons: poses of scans relative to the anchors.
         reflected: whether the first template was reflected after the comparisons.
-        subjects: of all scans, or empty.
+        subjects: subjects of all scans, or empty.
     """
 
     names: Sequence[str]
@@ -189,12 +192,12 @@ class _Problem:
 
 @dataclass(frozen=True)
 class RoundRecord:
-    """What one round cost and changed.
+    """Cost and result of one round.
 
     Args:
         moved: RMS movement of the vertices of all scans, share of the size.
-        scan_moved: the same of each registered scan, by its number.
-        cpu_s: of each scan that was tried.
+        scan_moved: RMS movement of the vertices of each registered scan, by its number, share of the size.
+        cpu_s: CPU time of each scan that was tried, seconds.
     """
 
     moved: float
@@ -208,16 +211,16 @@ class RegistrationState:
 
     Args:
         template: the mean shape, of the size `SIZE`.
-        landmarks: the landmarks that scans have, on the template.
-        registrations: of the scans that are not excluded, by their number.
-        excluded: the reason for each other scan.
-        predictions: (V, 3) where the registration of a scan begins in the next round.
-        sides: of all scans, by the comparisons before the first round.
+        landmarks: landmarks of the scans, on the template.
+        registrations: registrations of the scans that are not excluded, by their number.
+        excluded: reason for each excluded scan.
+        predictions: (V, 3) vertices from which the registration of each scan begins in the next round.
+        sides: sides of all scans, from the comparisons before the first round.
         rounds: one record for each round so far.
-        other_kinds: of the scans that were in another group than the largest, the first scan of their group.
+        other_kinds: scans that were in another group than the largest -> the first scan of their group.
         consensus: poses of the scans, or of their mirror images, on which the comparisons with anchors agree (C32).
-        bent: the scans whose next registration begins at their own surface, since no other scan predicts it.
-        relief_agreement: of each registered scan with the median relief (C35); empty for few scans.
+        bent: scans whose next registration begins at their own surface, since no other scan predicts it.
+        relief_agreement: agreement of each registered scan with the median relief (C35); empty for few scans.
         symmetries: (S, V) near symmetries of an object that bends; None if there are none.
     """
 
@@ -237,7 +240,7 @@ class RegistrationState:
     @property
     def bends(self) -> bool:
         """Whether the object bends: several scans are less strained if they begin at a map along the surface."""
-        bent = [one.bent for one in self.registrations.values()]
+        bent = [registration.bent for registration in self.registrations.values()]
         return sum(bent) >= max(2.0, _BENDS * len(bent))
 
     def agrees_less_than_usual(self, i: int, by: float = 0.0) -> bool:
@@ -246,13 +249,13 @@ class RegistrationState:
         return bool(self.relief_agreement.get(i, 0.0) < usual - by)
 
     def is_mirrored(self, i: int) -> bool:
-        """Return whether scan `i` is a mirror image of the majority, as far as is known."""
+        """Return whether scan `i` is a mirror image of the majority, as far as known."""
         if i in self.registrations:
             return self.registrations[i].mirrored
         return bool(self.sides.mirrored[i])
 
     def shapes(self, order: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-        """Return the vertices (N, V, 3) of scans in the template's frame, and (N, V) 1.0 where they are observed."""
+        """Return the vertices (N, V, 3) of scans in the template's frame, and (N, V) 1.0 at observed vertices."""
         shapes = np.stack([self.registrations[i].vertices for i in order])
         return shapes, np.stack([self.registrations[i].observed for i in order]).astype(np.float64)
 
@@ -265,12 +268,12 @@ def _initial_state(problem: _Problem, sides: Sides) -> RegistrationState:
 # Sides
 
 
-def _with_sides(problem: _Problem, run: Runner, *, may_reflect: bool) -> tuple[_Problem, Sides]:
+def _decide_sides(problem: _Problem, run: Runner, *, may_reflect: bool) -> tuple[_Problem, Sides]:
     """Return the sides of all scans, and the problem with their comparisons and its template on the majority's side.
 
     Args:
         problem: the scans and the first template.
-        run: does the comparisons.
+        run: function that does the comparisons.
         may_reflect: whether the template may be reflected; otherwise its side is that of the majority.
     """
     count = len(problem.names)
@@ -278,11 +281,11 @@ def _with_sides(problem: _Problem, run: Runner, *, may_reflect: bool) -> tuple[_
     is_enough = len(problem.first.repaired) >= ENOUGH_TO_JUDGE
     if problem.config.mirror == "never" and (problem.config.pose != "search" or not is_enough):  # nothing is compared
         return problem, sides
-    context, scores = _context(problem, _initial_state(problem, sides)), np.zeros((0, count, 2))
+    context, scores = _round_context(problem, _initial_state(problem, sides)), np.zeros((0, count, 2))
     anchors: list[int] = []
-    for i, pose_model in chain([(TEMPLATE, context.pose_models[0])], _anchors(problem)):
+    for i, pose_model in chain([(TEMPLATE, context.pose_models[0])], _find_anchors(problem)):
         anchors.append(i)
-        problem, row = _compared_with(problem, replace(context, pose_models=(pose_model,)), i, run)
+        problem, row = _compare_with_anchor(problem, replace(context, pose_models=(pose_model,)), i, run)
         scores = np.concatenate([scores, row[None]])
         if len(anchors) > _ANCHORS and problem.config.mirror != "never":
             sides = solve_sides(scores, anchors, problem.config.seed)
@@ -290,10 +293,10 @@ def _with_sides(problem: _Problem, run: Runner, *, may_reflect: bool) -> tuple[_
         if len(anchors) > (_MOST_ANCHORS if is_unsure else _ANCHORS):
             break
     if may_reflect and sides.decided and sides.mirrored.sum() > len(problem.first.repaired) / 2:
-        if problem.config.pose != "search":  # the frame of a reflected template is that of no file
+        if problem.config.pose != "search":  # the frame of a reflected template is not that of any file
             raise InputError(
                 f"--pose {problem.config.pose} cannot be used: the first template is a mirror image of most scans. "
-                "Give one of those as --template, or leave --pose out."
+                "Give one of those as --template, or omit --pose."
             )
         first = replace(problem.first, mesh=mirror_image(problem.first.mesh))
         usable = np.isin(np.arange(count), list(problem.first.repaired))
@@ -301,7 +304,9 @@ def _with_sides(problem: _Problem, run: Runner, *, may_reflect: bool) -> tuple[_
     return problem, sides
 
 
-def _compared_with(problem: _Problem, context: RoundContext, anchor: int, run: Runner) -> tuple[_Problem, FloatArray]:
+def _compare_with_anchor(
+    problem: _Problem, context: RoundContext, anchor: int, run: Runner
+) -> tuple[_Problem, FloatArray]:
     """Return the problem with the comparisons of all scans with an anchor, and the scores (N, 2) of both sides."""
     sides: Comparison = "pose" if problem.config.mirror == "never" else "scores"
     tasks = [
@@ -312,12 +317,14 @@ def _compared_with(problem: _Problem, context: RoundContext, anchor: int, run: R
     comparisons = list(problem.comparisons)
     for compared in run(context, tasks):
         scores[compared.index] = compared.scores.pose, compared.scores.mirrored
-        T_image = next((one.T_scan_template for one in compared.alternatives if one.mirrored), None)
+        T_image = next(
+            (alternative.T_scan_template for alternative in compared.alternatives if alternative.mirrored), None
+        )
         comparisons.append(PoseComparison(anchor, compared.index, compared.T_scan_template, T_image))
     return replace(problem, comparisons=tuple(comparisons)), scores
 
 
-def _anchors(problem: _Problem) -> Iterator[tuple[int, PoseModel]]:
+def _find_anchors(problem: _Problem) -> Iterator[tuple[int, PoseModel]]:
     """Yield the number and the pose model of some scans that can be templates."""
     for i in np.random.default_rng(problem.config.seed).permutation(list(problem.first.repaired)).tolist():
         try:
@@ -326,27 +333,27 @@ def _anchors(problem: _Problem) -> Iterator[tuple[int, PoseModel]]:
             continue
 
 
-# What a round does
+# One round
 
 
-def _context(problem: _Problem, state: RegistrationState) -> RoundContext:
-    """Return what the tasks of the next round share."""
+def _round_context(problem: _Problem, state: RegistrationState) -> RoundContext:
+    """Return the shared input of the tasks of the next round."""
     order, seed = sorted(state.registrations), problem.config.seed
     if len(order) < ENOUGH_TO_JUDGE:
         guide = None if state.registrations else problem.first.guide
         pose_model = PoseModel.of(state.template) if guide is None else PoseModel(guide)
         return RoundContext(state.template, problem.harmonics, (pose_model,), seed, guide)
-    shapes, parts = state.shapes(order)[0], np.array([_part(i) for i in order])
+    shapes, parts = state.shapes(order)[0], np.array([_part_of_scan(i) for i in order])
     pose_models = tuple(PoseModel.of(state.template, shapes[parts != part]) for part in range(_PARTS))
     return RoundContext(state.template, problem.harmonics, pose_models, seed)
 
 
-def _part(i: int) -> int:
+def _part_of_scan(i: int) -> int:
     """Return the part of the scans that scan `i` belongs to; the pose model of a part is trained without it."""
     return i % _PARTS
 
 
-def _task(problem: _Problem, state: RegistrationState, i: int) -> RegistrationTask:
+def _make_task(problem: _Problem, state: RegistrationState, i: int) -> RegistrationTask:
     """Return the task of scan `i` in the next round; an excluded scan is searched for in all poses."""
     known, config = i in state.registrations, problem.config
     mirrored = state.is_mirrored(i)
@@ -357,10 +364,10 @@ def _task(problem: _Problem, state: RegistrationState, i: int) -> RegistrationTa
         T_scan_template=_pose_with_usual_size(state, i) if known else None,
         expected=state.predictions.get(i) if known else None,
         settings=config.next if known else config.first,
-        pose_model=_part(i) if len(state.registrations) >= ENOUGH_TO_JUDGE else 0,
+        pose_model=_part_of_scan(i) if len(state.registrations) >= ENOUGH_TO_JUDGE else 0,
         landmarks=problem.landmarks(state.landmarks, scan),
         mirrored=mirrored,
-        sides=_comparison(problem, state, i),
+        sides=_choose_comparison(problem, state, i),
         pose=config.pose,
         other_pose=_other_pose(state, i),
         bent=i in state.bent and known,
@@ -370,15 +377,15 @@ def _task(problem: _Problem, state: RegistrationState, i: int) -> RegistrationTa
 
 
 def _other_pose(state: RegistrationState, i: int) -> Similarity | None:
-    """Return the pose of scan `i` on which the comparisons agree, if it is known and another one than its own."""
+    """Return the pose of scan `i` on which the comparisons agree, if it is known and differs from its own."""
     T = state.consensus.get(i)
     if T is None or i not in state.registrations:
         return None
     return T if angle_deg(T, state.registrations[i].T_scan_template) > SAME_POSE_DEG else None
 
 
-def _comparison(problem: _Problem, state: RegistrationState, i: int) -> Comparison:
-    """Return how scan `i` is compared with its mirror image in the next round."""
+def _choose_comparison(problem: _Problem, state: RegistrationState, i: int) -> Comparison:
+    """Return the comparison of scan `i` with its mirror image in the next round."""
     if problem.config.mirror == "never":
         return "as given"
     if not (state.sides.decided and state.registrations):
@@ -392,9 +399,10 @@ def _comparison(problem: _Problem, state: RegistrationState, i: int) -> Comparis
 
 
 def _pose_with_usual_size(state: RegistrationState, i: int) -> Similarity:
-    """Return the pose of a scan; if the scan is partial, with its size shrunk towards that of the whole scans.
+    """Return the pose of a scan; if the scan is partial, with its size shrunk towards that of the complete scans.
 
-    A bone without its end fits a smaller whole bone, so its own size has a variance that grows with what is missing.
+    A bone without its end fits a smaller complete bone, so its own size has a variance that grows with the missing
+    share.
     """
     T, observed = state.registrations[i].T_scan_template, state.registrations[i].observed
     order = sorted(state.registrations)
@@ -431,25 +439,27 @@ def _next_state(
         raise InputError(
             f"Only {len(state.registrations)} of {len(problem.names)} scans could be registered: {reasons}."
         )
-    return _update_template(problem, previous, state, {one.index: one.cpu_s for one in ended})
+    return _update_template(
+        problem, previous, state, {registration.index: registration.cpu_s for registration in ended}
+    )
 
 
-def _with_sides_by_strain(
+def _decide_sides_by_strain(
     problem: _Problem, previous: RegistrationState, state: RegistrationState, run: Runner
 ) -> RegistrationState:
     """Return the state of the first round with the sides of an object that bends.
 
-    Scores of rigid poses do not show the side of limbs that have moved. A scan stays reflected only where its mirror
-    image is clearly less strained than the scan as it is.
+    Scores of rigid poses do not show the side of limbs that have moved. A scan stays reflected only if its mirror
+    image is clearly less strained than the scan itself.
     """
-    reflected = [i for i, one in state.registrations.items() if one.mirrored]
+    reflected = [i for i, registration in state.registrations.items() if registration.mirrored]
     if not reflected:
         return state
     as_given = replace(previous, sides=replace(previous.sides, mirrored=np.zeros(len(problem.names), np.bool_)))
-    tasks = [replace(_task(problem, as_given, i), sides="as given") for i in reflected]
+    tasks = [replace(_make_task(problem, as_given, i), sides="as given") for i in reflected]
     registrations, cpu_s = dict(state.registrations), dict(state.rounds[-1].cpu_s)
     mirrored = np.array(as_given.sides.mirrored)
-    for registration in run(_context(problem, as_given), tasks):
+    for registration in run(_round_context(problem, as_given), tasks):
         i = registration.index
         cpu_s[i] += registration.cpu_s
         if _exclusion_reason(problem.config, registration) or (
@@ -463,20 +473,20 @@ def _with_sides_by_strain(
     return _update_template(problem, previous, state, cpu_s)
 
 
-def _registered_by_subject(
+def _register_by_subject(
     problem: _Problem, previous: RegistrationState, state: RegistrationState, run: Runner
 ) -> RegistrationState:
-    """Return the state of the first round with each scan registered from the surface of another one of its subject."""
+    """Return the state of the first round with each scan registered from the surface of another scan of its subject."""
     order = sorted(state.registrations)
     levels = subject_levels(state.shapes(order)[0], state.template.vertices, [problem.subjects[i] for i in order])
-    context, registrations = _context(problem, state), dict(state.registrations)
+    context, registrations = _round_context(problem, state), dict(state.registrations)
     cpu_s = dict(state.rounds[-1].cpu_s)
     for level in levels:
         tasks: list[RegistrationTask] = []
         for i, parent in ((order[child], order[parent]) for child, parent in level):
             start = registrations[parent].vertices
             T = registrations[i].T_scan_template @ fit_similarity(start, registrations[i].vertices)
-            task = replace(_task(problem, state, i), T_scan_template=T, expected=start, is_start_known=True)
+            task = replace(_make_task(problem, state, i), T_scan_template=T, expected=start, is_start_known=True)
             tasks.append(replace(task, settings=problem.config.first))
         for registration in run(context, tasks):
             i = registration.index
@@ -489,7 +499,7 @@ def _registered_by_subject(
     return _update_template(problem, previous, state, cpu_s)
 
 
-# Which registrations are used
+# Selection of the registrations
 
 
 def _accept(problem: _Problem, previous: RegistrationState, ended: Sequence[ScanRegistration]) -> RegistrationState:
@@ -508,16 +518,16 @@ def _accept(problem: _Problem, previous: RegistrationState, ended: Sequence[Scan
 
 
 def _exclusion_reason(config: CorrespondConfig, registration: ScanRegistration) -> str:
-    """Return why a registration is not used; empty if it is."""
+    """Return why a registration is not used; empty if it is used."""
     if registration.reason:
         return registration.reason
     if registration.covered < config.fewest_covered:
         return (
-            f"surface not reached: the template covers {100 * registration.covered:.0f} % of it; another object, or "
-            f"one with much beside it{_wrong_names(registration)}"
+            f"surface not reached: the template covers {100 * registration.covered:.0f} % of the scan; it shows "
+            f"another object, or much besides the object{_wrong_names(registration)}"
         )
     if registration.observed.mean() < config.fewest_seen:
-        return f"half missing: it shows {100 * registration.observed.mean():.0f} % of the template"
+        return f"incomplete: it shows {100 * registration.observed.mean():.0f} % of the template"
     return ""
 
 
@@ -527,10 +537,10 @@ def _wrong_names(registration: ScanRegistration) -> str:
 
 
 def _exclude_other_kinds(problem: _Problem, state: RegistrationState, order: Sequence[int]) -> RegistrationState:
-    """Exclude the scans in `order` that are another kind of object than the largest group, or are like no other."""
-    if problem.subjects:  # scans of one subject predict each other, and are no kind of object
+    """Exclude the scans in `order` that are another kind of object than the largest group, or resemble no other."""
+    if problem.subjects:  # scans of one subject predict each other, and are not a kind of object
         order = list({problem.subjects[i]: i for i in sorted(order, reverse=True)}.values())
-    if len(order) < ENOUGH_TO_JUDGE or state.bends:  # other poses are no other kinds
+    if len(order) < ENOUGH_TO_JUDGE or state.bends:  # other poses are not other kinds
         return state
     order, config = sorted(order), problem.config
     shapes, observed = state.shapes(order)
@@ -546,7 +556,7 @@ def _exclude_other_kinds(problem: _Problem, state: RegistrationState, order: Seq
         members = [order[int(k)] for k in group]
         other_kinds |= dict.fromkeys(members, members[0])
         reasons |= dict.fromkeys(members, _another_kind(len(members), len(kinds.groups[0])))
-    registrations = {i: one for i, one in state.registrations.items() if i not in reasons}
+    registrations = {i: registration for i, registration in state.registrations.items() if i not in reasons}
     excluded = {**state.excluded, **reasons}
     return replace(state, registrations=registrations, excluded=excluded, other_kinds=other_kinds)
 
@@ -563,7 +573,7 @@ def _outlier_reason(registration: ScanRegistration, distance: float) -> str:
 
 
 def _resolve_alternatives(problem: _Problem, state: RegistrationState) -> RegistrationState:
-    """Where several poses are about as likely, use the one whose shape the scans of sure pose predict best."""
+    """If several poses are about equally likely, use the one whose shape the scans of certain pose predict best."""
     sure = [i for i, registration in state.registrations.items() if not registration.alternatives]
     if not _ENOUGH_TO_PREDICT <= len(sure) < len(state.registrations):
         return state
@@ -572,34 +582,36 @@ def _resolve_alternatives(problem: _Problem, state: RegistrationState) -> Regist
     predictor = ShapePredictor.of(shapes, problem.config.noise_share)
     middle = Reliefs.of(shapes, observed, state.template, problem.harmonics).median()
 
-    def unlikelihood(one: ScanRegistration) -> float:
-        distance = predictor.distance(one.vertices, one.observed.astype(np.float64))
-        own = relief(one.vertices, state.template, problem.harmonics)
-        return float(np.log(distance)) - _RELIEF * agreement(own, middle, problem.harmonics.area * one.observed)  # C15
+    def unlikelihood(registration: ScanRegistration) -> float:
+        distance = predictor.distance(registration.vertices, registration.observed.astype(np.float64))
+        own = relief(registration.vertices, state.template, problem.harmonics)
+        return float(np.log(distance)) - _RELIEF * agreement(
+            own, middle, problem.harmonics.area * registration.observed
+        )  # C15
 
     def best(registration: ScanRegistration) -> ScanRegistration:
         if not registration.alternatives:
             return registration
         return min((registration, *registration.alternatives), key=unlikelihood)
 
-    return replace(state, registrations={i: best(one) for i, one in state.registrations.items()})
+    return replace(state, registrations={i: best(registration) for i, registration in state.registrations.items()})
 
 
 def _exclude_mirrored(problem: _Problem, state: RegistrationState) -> RegistrationState:
-    """Exclude mirrored scans, where the user wants to be asked."""
+    """Exclude mirrored scans if the setting `mirror` is `ask`."""
     if problem.config.mirror != "ask":
         return state
     reason = "mirrored: its mirror image fits the other scans better; reflect it, or choose --mirror auto"
-    mirrored = {i: reason for i, one in state.registrations.items() if one.mirrored}
-    registrations = {i: one for i, one in state.registrations.items() if not one.mirrored}
+    mirrored = {i: reason for i, registration in state.registrations.items() if registration.mirrored}
+    registrations = {i: registration for i, registration in state.registrations.items() if not registration.mirrored}
     return replace(state, registrations=registrations, excluded={**state.excluded, **mirrored})
 
 
 # Evidence
 
 
-def _evidence(state: RegistrationState) -> dict[int, ScanEvidence]:
-    """Return the evidence on each registered scan; none if there are too few to determine what is usual."""
+def _find_evidence(state: RegistrationState) -> dict[int, ScanEvidence]:
+    """Return the evidence on each registered scan; none if there are too few scans to determine the usual values."""
     if not state.relief_agreement:
         return {}
     usual = float(np.median(list(state.relief_agreement.values())))
@@ -641,10 +653,10 @@ def _update_template(
         predictions = dict(zip(order, predicted, strict=True))
     template = Mesh(mean, state.template.faces, name=state.template.name, colours=_median_colours(registrations))
     bent = frozenset(i for i in order if registrations[i].bent)
-    if state.bends:  # a mean of poses is no shape, and no pose is predicted by others
+    if state.bends:  # a mean of poses is not a shape, and other scans predict no pose
         bent, template = frozenset(order), state.template
     predictions = {**predictions, **{i: registrations[i].vertices for i in bent}}
-    maps = [one.symmetries for one in registrations.values() if one.symmetries is not None]
+    maps = [registration.symmetries for registration in registrations.values() if registration.symmetries is not None]
     agreements: dict[int, float] = {}
     if len(order) >= ENOUGH_TO_JUDGE:
         reliefs = Reliefs.of(shapes, observed, template, problem.harmonics)
@@ -663,7 +675,7 @@ def _update_template(
         sides=state.sides,
         rounds=(*state.rounds, record),
         other_kinds=state.other_kinds,
-        consensus=_consensus(problem, state),
+        consensus=_find_consensus(problem, state),
         bent=bent,
         relief_agreement=agreements,
         symmetries=common_symmetries(maps, template) if state.bends else None,
@@ -672,42 +684,52 @@ def _update_template(
 
 def _median_colours(registrations: Mapping[int, ScanRegistration]) -> ByteArray | None:
     """Return the colours of the template: at each vertex the median of the scans that have colours and observe it."""
-    coloured = [one for one in registrations.values() if one.colours is not None]
+    coloured = [registration for registration in registrations.values() if registration.colours is not None]
     if not coloured:
         return None
-    seen = np.stack([one.observed for one in coloured])
+    seen = np.stack([registration.observed for registration in coloured])
     seen |= ~seen.any(axis=0)
-    colours = np.where(seen[:, :, None], np.stack([one.colours for one in coloured if one.colours is not None]), np.nan)
+    colours = np.where(
+        seen[:, :, None],
+        np.stack([registration.colours for registration in coloured if registration.colours is not None]),
+        np.nan,
+    )
     return np.nanmedian(colours, axis=0).astype(np.uint8)
 
 
-def _consensus(problem: _Problem, state: RegistrationState) -> dict[int, Similarity]:
-    """Return the poses on which the comparisons agree (C32); none for few scans, and where frames of files are used."""
+def _find_consensus(problem: _Problem, state: RegistrationState) -> dict[int, Similarity]:
+    """Return the poses on which the comparisons agree (C32); none for few scans, or if frames of files are used."""
     if problem.config.pose != "search" or len(problem.first.repaired) < ENOUGH_TO_JUDGE:
         return {}
     mirrored = {TEMPLATE: problem.reflected} | {i: state.is_mirrored(i) for i in range(len(problem.names))}
     poses = consensus_poses(problem.comparisons, mirrored)
-    angles = [angle_deg(poses[i], one.T_scan_template) for i, one in state.registrations.items() if i in poses]
-    # Where most contradict it, the comparisons with the template are wrong and not the scans.
+    angles = [
+        angle_deg(poses[i], registration.T_scan_template)
+        for i, registration in state.registrations.items()
+        if i in poses
+    ]
+    # If most scans contradict the comparisons with the template, these are wrong and not the scans.
     return poses if angles and np.median(angles) < SAME_POSE_DEG else {}
 
 
 def _squared_movement(previous: RegistrationState, i: int, shape: FloatArray) -> float:
-    """Return the mean squared movement of the vertices of scan `i` since the last round; its first is from the mean."""
+    """Return the mean squared movement of the vertices of scan `i` since the last round, or since the mean at first."""
     known = i in previous.registrations
     before = previous.registrations[i].vertices if known else previous.template.vertices
     return float(((fit_similarity(before, shape).apply(before) - shape) ** 2).sum(axis=1).mean())
 
 
 def _landmarks_on(template: Mesh, problem: _Problem, registrations: Mapping[int, ScanRegistration]) -> SurfaceLandmarks:
-    """Return where the landmarks of the registered scans are on the template."""
+    """Return the positions of the landmarks of the registered scans on the template."""
 
     def in_template_frame(i: int) -> dict[str, FloatArray]:
         T_template_scan = registrations[i].T_scan_template.inverse()
         scan = problem.scan(i, mirrored=registrations[i].mirrored)
         return {name: T_template_scan.apply(point) for name, point in scan.landmarks.items()}
 
-    return consensus_landmarks(template, [(one.vertices, in_template_frame(i)) for i, one in registrations.items()])
+    return consensus_landmarks(
+        template, [(registration.vertices, in_template_frame(i)) for i, registration in registrations.items()]
+    )
 
 
 # Scans added to a finished correspondence
@@ -718,14 +740,14 @@ class FinishedCorrespondence:
     """The result of `correspond` that scans are added to.
 
     Args:
-        mean: its mean shape, of the size `SIZE`.
-        landmarks: on the mean.
-        surfaces: in correspondence, each in the frame and unit of its scan, with `Mesh.observed`; those of mirrored
-            scans are reflected. Their landmarks are used if the mean has none.
-        scans: the raw scans of the surfaces; empty if the mean and the surfaces stay.
-        mirrored: which of the scans are mirrored; empty if none is.
-        sides_decided: as of `Correspondence`.
-        judged: results of the scans, which those of added scans are compared with; empty if unknown.
+        mean: mean shape, of the size `SIZE`.
+        landmarks: landmarks on the mean.
+        surfaces: surfaces in correspondence, each in the frame and unit of its scan, with `Mesh.observed`; those of
+            mirrored scans are reflected. Their landmarks are used if the mean has none.
+        scans: raw scans of the surfaces; empty if the mean and the surfaces stay unchanged.
+        mirrored: whether each scan is mirrored; empty if none is.
+        sides_decided: whether scans could be distinguished from their mirror images, see `Correspondence`.
+        judged: results of the scans, with which those of added scans are compared; empty if unknown.
     """
 
     mean: Mesh
@@ -746,14 +768,14 @@ def add_scans(
 ) -> Correspondence:
     """Register `scans` to the mean of a finished correspondence, each with the finished surfaces as prior.
 
-    No result depends on the other added scans, and mean and surfaces stay as they are. With `finished.scans` one more
-    round over all scans follows, which computes the mean and all surfaces anew.
+    No result depends on the other added scans, and mean and surfaces stay unchanged. With `finished.scans` another
+    round over all scans follows, which computes the mean and all surfaces again.
 
     Args:
         finished: the correspondence.
         scans: the scans to add, in any pose, size and unit.
-        config: of the finished correspondence.
-        run: does the tasks of a round.
+        config: settings of the finished correspondence.
+        run: function that does the tasks of a round.
 
     Returns:
         The mean, and the results of `scans` alone; with `finished.scans` those of all scans, the finished ones first.
@@ -773,13 +795,13 @@ def add_scans(
     problem = _Problem.of(names, first, config)
     start = _finished_state(problem, finished)
     states = _added_states(problem, start, [i for i in repaired if i >= kept], run)
-    judged = {i: _judged_by_finished(problem, state, i) for i, state in states.items()}
+    judged = {i: _judge_by_finished(problem, state, i) for i, state in states.items()}
     if finished.scans:
-        state = _merged(start, {i: state for i, (state, _) in judged.items()})
+        state = _merge_states(start, {i: state for i, (state, _) in judged.items()})
         state = replace(_update_template(problem, state, state, {}), rounds=())
-        registrations = run(_context(problem, state), [_task(problem, state, i) for i in repaired])
+        registrations = run(_round_context(problem, state), [_make_task(problem, state, i) for i in repaired])
         state = _next_state(problem, state, registrations)
-        return _result(problem, state, _evidence(state))
+        return _make_result(problem, state, _find_evidence(state))
     confidence = VertexConfidence.of(finished.mean, problem.harmonics)
     results = [_added_result(problem, *judged.get(i, (start, None)), i, confidence) for i in range(kept, len(names))]
     if finished.judged:
@@ -811,10 +833,10 @@ def _finished_state(problem: _Problem, finished: FinishedCorrespondence) -> Regi
         finished.mean,
         [
             (
-                one.vertices,
-                {k: one.T_scan_template.inverse().apply(x) for k, x in finished.surfaces[i].landmarks.items()},
+                registration.vertices,
+                {k: registration.T_scan_template.inverse().apply(x) for k, x in finished.surfaces[i].landmarks.items()},
             )
-            for i, one in registrations.items()
+            for i, registration in registrations.items()
         ],
     )
     unknown = np.zeros(len(problem.names))
@@ -825,7 +847,7 @@ def _finished_state(problem: _Problem, finished: FinishedCorrespondence) -> Regi
 def _added_states(
     problem: _Problem, start: RegistrationState, added: Sequence[int], run: Runner
 ) -> dict[int, RegistrationState]:
-    """Return for each scan of `added` the state with the finished scans and it alone, after its last round."""
+    """Return for each scan of `added` the state of the finished scans and this scan, after its last round."""
     shapes = start.shapes(sorted(start.registrations))[0]
     prior = shapes if len(shapes) >= ENOUGH_TO_JUDGE else None
     pose_models = (PoseModel.of(start.template, prior),)  # it is trained without all added scans
@@ -835,11 +857,11 @@ def _added_states(
     states = dict.fromkeys(added, start)
     left = list(added)
     for _ in range(problem.config.rounds):
-        tasks = [replace(_task(problem, states[i], i), pose_model=0) for i in left]
+        tasks = [replace(_make_task(problem, states[i], i), pose_model=0) for i in left]
         for registration in run(context, tasks):
             i = registration.index
             states[i] = _next_added_state(problem, start, states[i], registration, predictor)
-        # The mean stays, so an excluded scan would be excluded again.
+        # The mean stays unchanged, so an excluded scan would be excluded again.
         left = [i for i in left if states[i].rounds and states[i].rounds[-1].moved >= problem.config.settled]
     return states
 
@@ -851,7 +873,7 @@ def _next_added_state(
     registration: ScanRegistration,
     predictor: ShapePredictor | None,
 ) -> RegistrationState:
-    """Return the state after a round of one added scan; the finished scans and their mean stay."""
+    """Return the state after a round of one added scan; the finished scans and their mean stay unchanged."""
     i, kept = registration.index, start.registrations
     state = _accept(problem, previous, [registration])
     if i not in state.registrations:
@@ -873,12 +895,12 @@ def _next_added_state(
     return replace(start, registrations={**kept, i: own}, predictions=predicted, rounds=rounds)
 
 
-def _judged_by_finished(
+def _judge_by_finished(
     problem: _Problem, state: RegistrationState, i: int
 ) -> tuple[RegistrationState, ScanEvidence | None]:
-    """Return the state of an added scan, without it if it is an outlier among the finished ones, and their evidence.
+    """Return the state of an added scan, which excludes an outlier among the finished scans, and their evidence.
 
-    There is no evidence where they are too few.
+    There is no evidence if there are too few finished scans.
     """
     kept = sorted(state.registrations.keys() - {i})
     judges = kept[:: -(-len(kept) // _JUDGES)]
@@ -890,13 +912,13 @@ def _judged_by_finished(
     *others, own = Reliefs.of(shapes, observed, state.template, problem.harmonics).agreements(finished).tolist()
     if is_outlier(distance, own, problem.config.outlier_threshold):
         excluded = {i: _outlier_reason(state.registrations[i], float(distance))}
-        registrations = {j: one for j, one in state.registrations.items() if j != i}
+        registrations = {j: registration for j, registration in state.registrations.items() if j != i}
         return replace(state, registrations=registrations, excluded=excluded), None
     return state, ScanEvidence(relief_agreement=own, usual_relief_agreement=float(np.median(others)))
 
 
-def _merged(start: RegistrationState, states: Mapping[int, RegistrationState]) -> RegistrationState:
-    """Return the state with the finished scans and all added ones."""
+def _merge_states(start: RegistrationState, states: Mapping[int, RegistrationState]) -> RegistrationState:
+    """Return the state with the finished scans and all added scans."""
     registered = {i: state.registrations[i] for i, state in states.items() if i in state.registrations}
     excluded = {i: state.excluded[i] for i, state in states.items() if i not in registered}
     registrations, reasons = {**start.registrations, **registered}, {**start.excluded, **excluded}
@@ -906,8 +928,8 @@ def _merged(start: RegistrationState, states: Mapping[int, RegistrationState]) -
 # The result
 
 
-def _groups(state: RegistrationState) -> list[list[int]]:
-    """Return the scans in correspondence, then those of each other kind; empty where all are of one kind."""
+def _group_kinds(state: RegistrationState) -> list[list[int]]:
+    """Return the scans in correspondence, then those of each other kind; empty if all are of one kind."""
     others: dict[int, list[int]] = {}
     for i in sorted(state.other_kinds.keys() & state.excluded.keys()):
         others.setdefault(state.other_kinds[i], []).append(i)
@@ -915,11 +937,11 @@ def _groups(state: RegistrationState) -> list[list[int]]:
     return [sorted(state.registrations), *sorted(alike, key=len, reverse=True)] if alike else []
 
 
-def _result(
+def _make_result(
     problem: _Problem, state: RegistrationState, evidence: Mapping[int, ScanEvidence], given: str | None = None
 ) -> Correspondence:
     """Return the result of all scans; `given` is the template or model of the first round, None for later rounds."""
-    complete, groups = _complete_shapes(problem, state), _groups(state)
+    complete, groups = _complete_shapes(problem, state), _group_kinds(state)
     # A scan of another kind is tried again in each round, and can end with a reason that names no kind.
     kinds = {i: _another_kind(len(group), len(groups[0])) for group in groups[1:] for i in group}
     state = replace(state, excluded={**state.excluded, **kinds})
@@ -929,19 +951,19 @@ def _result(
     )
     points = state.landmarks.positions(state.template.vertices)
     template = state.template.with_vertices(state.template.vertices, points)
-    landmarks = replace(state.landmarks, distance_mm=np.empty(0))  # places on a mean have no given point
+    landmarks = replace(state.landmarks, distance_mm=np.empty(0))  # landmarks of a mean have no given point
     moved = tuple(record.moved for record in state.rounds)
     made = Correspondence(
         template, scans, problem.first.origin, moved, landmarks, sides_decided=state.sides.decided,
         groups=tuple(tuple(problem.names[i] for i in group) for group in groups), given=given or "",
     )  # fmt: skip
     if given is not None and not made.is_of_another_kind and len(state.registrations) < ENOUGH_TO_JUDGE:
-        scans = [_with_other_shape(scan) for scan in scans]
+        scans = [_note_other_shape(scan) for scan in scans]
     return replace(made, scans=judge_collection(scans, problem.config.settled))
 
 
-def _with_other_shape(scan: Corresponding) -> Corresponding:
-    """Return a scan, of too few to decide what is another object, with a note if its shape is quite another one."""
+def _note_other_shape(scan: Corresponding) -> Corresponding:
+    """Return a scan, of too few to find other objects, with a note if its shape differs clearly."""
     if scan.reason or not scan.moved or scan.moved[0] <= ANOTHER_SHAPE:
         return scan
     return scan.noting(
@@ -954,7 +976,7 @@ def _complete_shapes(problem: _Problem, state: RegistrationState) -> dict[int, F
     """Return the vertices (V, 3) of each registered scan, in the template's frame, with estimates where not observed.
 
     An estimate is the conditional mean by probabilistic PCA of all registered scans (C27). A vertex that fewer than
-    `FEWEST` scans observe, and any vertex of too few scans for a model, stays where the registration has put it.
+    `FEWEST` scans observe, and any vertex of too few scans for a model, keeps its registered position.
     """
     order = sorted(state.registrations)
     shapes, weights = state.shapes(order)
@@ -1007,13 +1029,13 @@ def _scan_result(
         doubt=judgement.doubt,
         evidence=evidence,
         position_std=T.scale * position_std,
-        measures=_measures(state.template, registration, moved),
+        measures=_measure_surface(state.template, registration, moved),
         notes=notes,
         area_share=None if scan.faces is None else area / float(face_areas(scan).sum()),
     )
 
 
-def _measures(template: Mesh, registration: ScanRegistration, moved: Sequence[float]) -> SurfaceMeasures:
+def _measure_surface(template: Mesh, registration: ScanRegistration, moved: Sequence[float]) -> SurfaceMeasures:
     """Return the measures of a surface in the frame of the template; `moved` are its movements in the rounds."""
     seen = np.where(registration.observed[:, None], registration.vertices, np.nan)
     changed = Distortion.of(template.with_vertices(seen), template)
@@ -1037,9 +1059,9 @@ def subject_levels(shapes: FloatArray, mean: FloatArray, subjects: Sequence[Hash
     nearest to the mean, such as the neutral face; extreme shapes follow through intermediate ones.
 
     Args:
-        shapes: (N, V, 3) aligned.
-        mean: (V, 3) of all shapes.
-        subjects: (N,) of the shapes.
+        shapes: (N, V, 3) aligned shapes.
+        mean: (V, 3) mean of all shapes.
+        subjects: (N,) subjects of the shapes.
     """
     members: dict[Hashable, list[int]] = {}
     for i, subject in enumerate(subjects):

@@ -1,8 +1,8 @@
 """Smooth functions on a surface: the eigenfunctions of its Laplacian, and diffusion of heat in them (C1).
 
 The height above the smoothed surface is its relief: bumps, edges and hollows. The registration brings surfaces near
-each other, and a smooth surface can be near in a wrong pose too. Its relief is then at other vertices, which the
-registration does not use. Equations Cn are those of docs/correspondence.md.
+each other, and a smooth surface can be near in a wrong pose too. Its relief then does not agree, which makes it a test
+that is independent of the registration. Equations Cn are those of docs/correspondence.md.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from shapespace.geometry.normals import cotangent_laplacian, vertex_normals
 from shapespace.types import BoolArray, FloatArray, Mesh
 
 _SHIFT = 1e-7
-"""Of the spectrum, in units of the last frequency that is wanted, so that what is factored is not singular."""
+"""Shift of the spectrum, in units of the last wanted frequency, so that the factored matrix is not singular."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class Harmonics:
     Args:
         functions: (V, K) float64, orthonormal by area: functions^T diag(area) functions = I.
         squared_frequency: (K,) mm^-2, growing; the first is 0.
-        area: (V,) mm^2 of each vertex.
+        area: (V,) area of each vertex, mm^2.
     """
 
     functions: FloatArray
@@ -46,7 +46,7 @@ class Harmonics:
         count = min(count, len(area) - 2)
         mass = sparse.diags_array(area).tocsc()
         shift = _SHIFT * 4 * np.pi * count / float(area.sum())
-        # Without a start of its own ARPACK draws one at random.
+        # Without a given start ARPACK draws a random one.
         start = np.ones(len(area)) + 0.1 * np.cos(np.arange(len(area)))
         squared, functions = cast(Any, eigsh)(laplacian.tocsc(), k=count, M=mass, sigma=-shift, v0=start)
         squared, functions = np.asarray(squared, dtype=np.float64), np.asarray(functions, dtype=np.float64)
@@ -55,11 +55,11 @@ class Harmonics:
         return Harmonics(functions, np.maximum(squared, 0.0), area)
 
     def slowest(self, count: int) -> Harmonics:
-        """Return the first `count` of them."""
+        """Return the first `count` harmonics."""
         return Harmonics(self.functions[:, :count], self.squared_frequency[:count], self.area)
 
     def coefficients(self, field: FloatArray) -> FloatArray:
-        """Return (K, C) of the functions in `field` (V, C)."""
+        """Return the (K, C) coefficients of the functions in `field` (V, C)."""
         return self.functions.T @ (self.area[:, None] * field)
 
     def attenuation(self, range_mm: float) -> FloatArray:
@@ -72,19 +72,19 @@ class Harmonics:
 
 
 _RANGE = 0.05
-"""Of the smoothing, share of the square root of the area: of 0.03, 0.05, 0.1 and 0.2 it separated right and wrong
+"""Range of the smoothing, share of the square root of the area: of 0.03, 0.05, 0.1 and 0.2 it separated right and wrong
 surfaces of 15 simulated kinds best."""
-_ENOUGH = 40  # surfaces, at most, whose median is used
+_ENOUGH = 40  # largest number of surfaces whose median is used
 _LARGEST = 0.9999  # correlation of copies, so that their agreement is finite
 
 
 def relief(vertices: FloatArray, template: Mesh, harmonics: Harmonics) -> FloatArray:
-    """Return (V,) the height of a surface above its smoothed version, along its normals (C34).
+    """Return the (V,) height of a surface above its smoothed version, along its normals (C34).
 
     Args:
         vertices: (V, 3) in correspondence with `template`.
-        template: its triangles.
-        harmonics: of the template.
+        template: mesh with the triangles of the surface.
+        harmonics: harmonics of the template.
     """
     smooth = harmonics.diffused(vertices, _RANGE * float(np.sqrt(harmonics.area.sum())))
     normals = vertex_normals(template.with_vertices(vertices))
@@ -92,7 +92,7 @@ def relief(vertices: FloatArray, template: Mesh, harmonics: Harmonics) -> FloatA
 
 
 def agreement(a: FloatArray, b: FloatArray, weights: FloatArray) -> float:
-    """Return the correlation of two reliefs (V,), transformed to the real line (C35); 0 where one is flat."""
+    """Return the correlation of two reliefs (V,), transformed to the real line (C35); 0 if one is flat."""
     weights = weights / max(float(weights.sum()), 1e-12)
     a, b = a - weights @ a, b - weights @ b
     spread = float(np.sqrt((weights @ a**2) * (weights @ b**2)))
@@ -104,9 +104,9 @@ class Reliefs:
     """The reliefs of surfaces in correspondence.
 
     Args:
-        heights: (N, V) of each surface.
-        observed: (N, V) bool, where a vertex is observed.
-        area: (V,) of each vertex.
+        heights: (N, V) relief of each surface.
+        observed: (N, V) bool, True at observed vertices.
+        area: (V,) area of each vertex.
     """
 
     heights: FloatArray
@@ -120,7 +120,7 @@ class Reliefs:
         return Reliefs(heights, observed > 0, harmonics.area)
 
     def median(self, core: npt.NDArray[np.integer] | None = None) -> FloatArray:
-        """Return (V,) the median of all or of `core`, at most `_ENOUGH` of them, where they are observed."""
+        """Return (V,) the median of all reliefs or of `core`, of at most `_ENOUGH`, where they are observed."""
         core = np.arange(len(self.heights)) if core is None else core
         some = core[:: -(-len(core) // _ENOUGH)]
         seen = self.observed[some]
@@ -128,7 +128,7 @@ class Reliefs:
         return np.nanmedian(np.where(seen, self.heights[some], np.nan), axis=0)
 
     def agreements(self, core: npt.NDArray[np.integer] | None = None) -> FloatArray:
-        """Return (N,) how well each relief agrees with the median of all or of `core` (C35)."""
+        """Return (N,) the agreement of each relief with the median of all or of `core` (C35)."""
         middle = self.median(core)
         return np.array(
             [agreement(own, middle, self.area * seen) for own, seen in zip(self.heights, self.observed, strict=True)]

@@ -1,6 +1,6 @@
-"""Where the registration of a bent object begins: a map from the template that keeps distances along the surface.
+"""Initial shapes for the registration of a bent object: maps from the template that keep distances along the surface.
 
-A limb that has moved far is near to another limb in space, but it has the same place along the surface. Distances
+A limb that has moved far is near to another limb in space, but its position along the surface is unchanged. Distances
 along the surface come from the eigenfunctions of the Laplacian, so no pose is needed. Equations Cn are those of
 docs/correspondence.md.
 """
@@ -18,20 +18,20 @@ from shapespace.correspondence.template import clean_scan, resample
 from shapespace.geometry.normals import edge_stretch, face_vectors, faces_of, rms_size, vertex_normals
 from shapespace.types import FloatArray, IntArray, Mesh
 
-_VERTICES = 2000  # of the coarse mesh of a scan, and at most of the template's that are mapped: cost grows with them
-_DISTANCE_FUNCTIONS = 60  # of the distances along the surface; the weight of the last one is below 0.001
+_VERTICES = 2000  # vertices of a scan's coarse mesh, and at most of the template that are mapped: the cost grows
+_DISTANCE_FUNCTIONS = 60  # functions for distances along the surface; the weight of the last one is below 0.001
 _COARSEST, _FINEST, _STEPS = 20, 80, 18
 """Functions of the map in the first and the last refinement. From 8 on, 2 of 10 figures had front and back swapped."""
 _FAR_APART = 0.35  # least distance of two extremities, share of the RMS distance along the surface
 _OWN_ENDS, _SCAN_ENDS, _FEWEST_ENDS = 6, 8, 3
-"""Extremities of the template and of the scan, at most, and at least: fewer leave rotations open."""
+"""Largest number of extremities of the template and of the scan, and the smallest: fewer leave rotations open."""
 _TRIED = 10  # assignments of extremities: each costs about 0.2 CPU s
 _SENSE = 0.75
 """Share of the area of the map, less that of the rest, that is not turned inside out: it was 0.87 or more in the right
 maps of 9 figures, and negative where left and right were exchanged."""
 _MAPS, _DISTINCT = 3, 0.05
-"""Maps to be registered, at most, and the least median distance of two of them, share of the size: stretch does not
-distinguish correct maps from those with front and back exchanged."""
+"""Largest number of maps to be registered, and the least median distance between two maps, share of the size: stretch
+does not distinguish correct maps from those with front and back exchanged."""
 _JACOBIANS = 3.0
 """RMS of the determinants in the first map, in which distances have about 2; 2 and 4 give the same maps."""
 _SMOOTH = 0.05  # range over which the determinants are averaged, share of the square root of the area
@@ -39,15 +39,15 @@ _SMOOTH = 0.05  # range over which the determinants are averaged, share of the s
 
 @dataclass(frozen=True, eq=False)
 class IntrinsicShape:
-    """A surface by quantities that bending does not change.
+    """A surface described by quantities that bending does not change.
 
     Args:
         mesh: the surface.
         functions: (V, K) eigenfunctions, scaled so that a constant is 1.
-        area: (V,) share of each vertex in the whole area.
+        area: (V,) area of each vertex as a share of the total area.
         embedding: (V, D) points whose distances are those along the surface, biharmonic (C50), of RMS 1.
         ends: (E,) vertices that are farthest from all others around them.
-        harmonics: of the surface.
+        harmonics: harmonics of the surface.
     """
 
     mesh: Mesh
@@ -65,7 +65,7 @@ class IntrinsicShape:
         embedding = slow.functions[:, 1:] / slow.squared_frequency[1:]  # C50
         embedding /= np.sqrt(area @ (embedding**2).sum(axis=1))
         functions = np.sqrt(total) * harmonics.slowest(_FINEST).functions
-        ends = _extremities(embedding, faces_of(mesh), most_ends)
+        ends = _find_extremities(embedding, faces_of(mesh), most_ends)
         return IntrinsicShape(mesh, functions, area, embedding, ends, harmonics)
 
     @staticmethod
@@ -73,7 +73,7 @@ class IntrinsicShape:
         """Return the intrinsic shape of the largest piece of `scan`, meshed evenly.
 
         Raises:
-            MeshError: it has no triangles, or is no sheet.
+            MeshError: the scan has no triangles, or they do not form a sheet.
         """
         mesh = resample(clean_scan(scan), _VERTICES)
         return IntrinsicShape.of(mesh, Harmonics.of(mesh, _FINEST), _SCAN_ENDS)
@@ -103,29 +103,29 @@ class IntrinsicShape:
 def bent_shapes(template: IntrinsicShape, scan: IntrinsicShape, seed: int) -> list[FloatArray]:
     """Return the template's vertices (V, 3) on `scan`, by the maps that change distances along the surface least.
 
-    Extremities are assigned by their distances from each other; each likely assignment gives a map, which is refined
+    Extremities are assigned by their distances from each other; each likely assignment yields a map, which is refined
     (ZoomOut; Melzi et al. 2019). It must not turn the surface inside out, which distinguishes left from right.
 
     Args:
         template: the surface that is mapped.
         scan: the surface that it is mapped onto.
-        seed: of the vertices of the template that are mapped.
+        seed: seed of the sample of the template's vertices that are mapped.
 
     Returns:
-        The distinct ones, at most `_MAPS`, least stretched first; none if there are too few extremities, or if no map
+        The distinct shapes, at most `_MAPS`, least stretched first; none if there are too few extremities, or if no map
         keeps the orientation.
     """
     rng = np.random.default_rng(seed)
     drawn = np.sort(rng.permutation(len(template.functions))[: _VERTICES // 2]).astype(np.int32)
     faces = faces_of(template.mesh)
     shapes: list[FloatArray] = []
-    for ends in _assignments(template, scan):
+    for ends in _yield_assignments(template, scan):
         own, theirs = template.distances(template.ends[: len(ends)]), scan.distances(ends)
         turns = template.determinants(own)
         scale = _JACOBIANS / max(float(np.sqrt((turns**2).mean())), 1e-12)
         features = np.hstack([own, scale * turns])[drawn]
         start = _nearest(features, np.hstack([theirs, scale * scan.determinants(theirs)]))
-        mapped = _refined(template, scan, start, drawn)
+        mapped = _refine_map(template, scan, start, drawn)
         shape = template.smooth(scan.mesh.vertices[mapped])
         if _orientation(shape, faces, vertex_normals(scan.mesh)[mapped]) >= _SENSE:
             shapes.append(shape)
@@ -134,7 +134,7 @@ def bent_shapes(template: IntrinsicShape, scan: IntrinsicShape, seed: int) -> li
 
 
 def distinct(shapes: Iterable[FloatArray], size_mm: float, known: Sequence[FloatArray] = ()) -> list[FloatArray]:
-    """Return those of `shapes` (V, 3) that are apart from the ones before, and from those that are known."""
+    """Return those of `shapes` (V, 3) that are apart from the ones before, and from known ones."""
     found: list[FloatArray] = []
     for shape in shapes:
         if all(is_apart(shape, other, size_mm) for other in (*known, *found)):
@@ -143,7 +143,7 @@ def distinct(shapes: Iterable[FloatArray], size_mm: float, known: Sequence[Float
 
 
 def is_apart(shape: FloatArray, other: FloatArray, size_mm: float) -> bool:
-    """Return whether two shapes (V, 3) on an object of that RMS size have most vertices in other places."""
+    """Return whether two shapes (V, 3) on an object of that RMS size have most vertices in different positions."""
     return float(np.median(np.linalg.norm(shape - other, axis=1))) > _DISTINCT * size_mm
 
 
@@ -151,11 +151,11 @@ def common_symmetries(maps: Iterable[IntArray], template: Mesh) -> IntArray | No
     """Return the distinct near symmetries (S, V) that most scans have, at most `_MAPS`; None if there are none.
 
     Args:
-        maps: (S, V) of each scan, as `ScanRegistration.symmetries`.
-        template: whose vertices they permute.
+        maps: (S, V) maps of each scan, see `ScanRegistration.symmetries`.
+        template: mesh whose vertices the maps permute.
     """
     vertices, size_mm = template.vertices, rms_size(template.vertices)
-    groups = [[np.arange(len(vertices), dtype=np.int32)]]  # the first one is no symmetry
+    groups = [[np.arange(len(vertices), dtype=np.int32)]]  # the first one is the identity
     for row in (row for rows in maps for row in rows):
         alike = [group for group in groups if not is_apart(vertices[row], vertices[group[0]], size_mm)]
         if alike:
@@ -166,7 +166,7 @@ def common_symmetries(maps: Iterable[IntArray], template: Mesh) -> IntArray | No
     return np.stack(common) if common else None
 
 
-def _extremities(embedding: FloatArray, faces: IntArray, most: int) -> IntArray:
+def _find_extremities(embedding: FloatArray, faces: IntArray, most: int) -> IntArray:
     """Return the vertices whose mean squared distance from all others is a maximum, largest first."""
     mean_squared = (embedding**2).sum(axis=1)  # the embedding is centred, as functions are orthogonal to a constant
     around = np.full(len(embedding), -np.inf)
@@ -183,7 +183,7 @@ def _extremities(embedding: FloatArray, faces: IntArray, most: int) -> IntArray:
     return np.array(ends, dtype=np.int32)
 
 
-def _assignments(template: IntrinsicShape, scan: IntrinsicShape) -> Iterator[IntArray]:
+def _yield_assignments(template: IntrinsicShape, scan: IntrinsicShape) -> Iterator[IntArray]:
     """Yield the ends of `scan` that correspond to those of the template, most similar distances first."""
     count = min(len(template.ends), len(scan.ends))
     if count < _FEWEST_ENDS:
@@ -196,8 +196,8 @@ def _assignments(template: IntrinsicShape, scan: IntrinsicShape) -> Iterator[Int
         yield scan.ends[order]
 
 
-def _refined(template: IntrinsicShape, scan: IntrinsicShape, start: IntArray, drawn: IntArray) -> IntArray:
-    """Return (V,) the vertex of the scan for each of the template, from that (M,) of the vertices `drawn`."""
+def _refine_map(template: IntrinsicShape, scan: IntrinsicShape, start: IntArray, drawn: IntArray) -> IntArray:
+    """Return (V,) the scan's vertex for each vertex of the template, from that (M,) of the vertices `drawn`."""
     area = template.area[drawn] / template.area[drawn].sum()
     mapped, own, theirs, C = start, template.functions, scan.functions, np.eye(0)
     for count in np.unique(np.geomspace(_COARSEST, _FINEST, _STEPS).round().astype(int)).tolist():
@@ -211,9 +211,9 @@ def _orientation(shape: FloatArray, faces: IntArray, normals: FloatArray) -> flo
     """Return the share of the area of `shape` that faces as the scan does, less that of the rest.
 
     Args:
-        shape: (V, 3) on the scan.
-        faces: of the shape.
-        normals: (V, 3) of the scan at its vertices.
+        shape: (V, 3) vertices on the scan.
+        faces: triangles of the shape.
+        normals: (V, 3) normals of the scan at these vertices.
     """
     vectors = face_vectors(shape, faces)
     areas = np.linalg.norm(vectors, axis=1)

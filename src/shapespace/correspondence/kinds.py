@@ -2,8 +2,8 @@
 
 A leave-one-out prediction from all shapes does not show a second kind that is frequent, since it is a part of the
 training set. Here a core of shapes grows from a few similar ones: it predicts all shapes, and takes those that it
-predicts about as well as its own. Scans of one person also predict each other best; another person is no other kind of
-object, since the reliefs agree (C35). The registrations of the next round begin at the same predictions.
+predicts about as well as its own. Scans of one person also predict each other best, but another person is not another
+kind of object, since the reliefs agree (C35). The registrations of the next round begin at the same predictions.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from shapespace.geometry.similarity import fit_similarity
 from shapespace.types import BoolArray, FloatArray
 
 _FOLDS, _MODES = 25, 100
-"""More shapes are predicted by those of other folds, by their strongest modes, so that cost grows as N does."""
+"""Number of shapes above which shapes are predicted by those of other folds, by their strongest modes: linear cost."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,10 +29,10 @@ class ShapePredictor:
     """Probabilistic PCA (Tipping and Bishop 1999) of some shapes, which predicts other ones (C13).
 
     Args:
-        mean: (V, 3).
+        mean: (V, 3) mean shape.
         modes: (3V, K) orthonormal.
         squares: (K,) sum of squares along each mode.
-        noise: of a coordinate, in the same sum.
+        noise: noise of a coordinate, as a sum of squares like `squares`.
     """
 
     mean: FloatArray
@@ -68,9 +68,9 @@ def predict_leave_one_out(shapes: FloatArray, weights: FloatArray, noise_share: 
     """Return (N, V, 3) the prediction of each of the aligned `shapes` (N, V, 3) from the others.
 
     Args:
-        shapes: aligned.
-        weights: (N, V) of their vertices, 0 to 1.
-        noise_share: as in `ShapePredictor.of`.
+        shapes: (N, V, 3) aligned shapes.
+        weights: (N, V) weights of their vertices, 0 to 1.
+        noise_share: share of noise, see `ShapePredictor.of`.
     """
     n, predicted = len(shapes), np.empty_like(shapes)
     for fold in np.array_split(np.arange(n), min(n, _FOLDS)):
@@ -95,12 +95,12 @@ _NOISE_SHARE = 0.1
 """Noise of predictions (C13). With 1, shapes of few modes are shrunk so much that their extremes look like others: 15
 of 20 simulated collections of 80 shapes with three modes were split, with 0.1 none of 8 of 40 shapes."""
 _LEAST_DISTANCE = 0.01
-"""Usual distance from the prediction, at least, share of the size: that of simulated shapes without noise goes to 0."""
+"""Lower bound of the usual distance from the prediction, share of the size: without noise the distance goes to 0."""
 _FEWEST = 5  # shapes of a core
-_POINTS = 600  # vertices that shapes are compared at
-_SEEDS = 8  # shapes that a core is grown from
-_GROWTH = 1.25  # factor by which a core grows in one step at most, so that its prediction follows
-_STEPS = 30  # at most
+_POINTS = 600  # number of vertices at which shapes are compared
+_SEEDS = 8  # number of shapes from which a core is grown
+_GROWTH = 1.25  # largest factor by which a core grows in one step, so that its prediction follows
+_STEPS = 30  # maximum number of steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,9 +108,9 @@ class Kinds:
     """The kinds of object of a collection.
 
     Args:
-        groups: indices of the shapes that are alike, largest group first; those in no group are missing.
-        distance: (N,) from the prediction by the largest group, in medians of its own.
-        relief_agreement: (N,) with the median relief of the largest group (C35); not-a-number if unknown.
+        groups: indices of the shapes that are alike, largest group first; shapes in no group are missing.
+        distance: (N,) distances from the prediction by the largest group, relative to the median of the group.
+        relief_agreement: (N,) agreement with the median relief of the largest group (C35); not-a-number if unknown.
     """
 
     groups: tuple[_Indices, ...]
@@ -122,10 +122,10 @@ def find_kinds(shapes: FloatArray, observed: FloatArray, template: FloatArray, r
     """Return the groups of `shapes` that predict each other and whose reliefs agree.
 
     Args:
-        shapes: (N, V, 3) in correspondence.
-        observed: (N, V) weights, 1 where a vertex is observed.
-        template: (V, 3) that shapes are aligned to.
-        reliefs: of the shapes; None if unknown.
+        shapes: (N, V, 3) shapes in correspondence.
+        observed: (N, V) weights, 1 at observed vertices.
+        template: (V, 3) shape to which shapes are aligned.
+        reliefs: reliefs of the shapes; None if unknown.
     """
     collection = Collection.of(shapes, observed, template)
     groups: list[_Indices] = []
@@ -152,14 +152,14 @@ def find_kinds(shapes: FloatArray, observed: FloatArray, template: FloatArray, r
 def is_outlier(distance: FloatArray, relief_agreement: FloatArray, threshold: float) -> BoolArray:
     """Return which shapes are far from their prediction by a group (C14), and have another relief (C35).
 
-    Another relief alone is no reason, as that of smooth objects is noise; their status shows it.
+    Another relief alone is not sufficient, as that of smooth objects is noise; their status shows it.
     """
     return (distance > threshold) & ~(relief_agreement > SAME_RELIEF)
 
 
 @dataclass(frozen=True, eq=False)
 class Collection:
-    """Shapes in correspondence, at some vertices, as for `find_kinds`."""
+    """Shapes in correspondence, at some vertices, see `find_kinds`."""
 
     shapes: FloatArray
     observed: FloatArray
@@ -195,8 +195,8 @@ class Collection:
         squared = squares[:, None] + squares - 2 * flat @ flat.T
         size = max(_FEWEST, len(candidates) // 4)
         seeds = np.unique(np.linspace(0, len(candidates) - 1, _SEEDS).round().astype(int))
-        cores = [self._grown(candidates[np.argsort(squared[seed])[:size]], candidates) for seed in seeds]
-        distinct = {core.tobytes(): core for core in cores}.values()  # mostly all are the same one
+        cores = [self._grow_core(candidates[np.argsort(squared[seed])[:size]], candidates) for seed in seeds]
+        distinct = {core.tobytes(): core for core in cores}.values()  # mostly all are the same
         return max(distinct, key=lambda core: self._separation(core, candidates))
 
     def _separation(self, core: _Indices, candidates: _Indices) -> float:
@@ -207,7 +207,7 @@ class Collection:
         outside = distance[np.setdiff1d(candidates, core)]
         return float(outside.min(initial=SAME_KIND) / max(distance[core].max(), SAME_KIND / 2))
 
-    def _grown(self, core: _Indices, candidates: _Indices) -> _Indices:
+    def _grow_core(self, core: _Indices, candidates: _Indices) -> _Indices:
         core = last = np.sort(core)
         for _ in range(_STEPS):
             distance = self.distances(core)[candidates]
@@ -215,7 +215,7 @@ class Collection:
             grown = np.sort(candidates[nearest[distance[nearest] <= SAME_KIND]])
             if np.array_equal(grown, core) or len(grown) < _FEWEST:
                 return grown if len(grown) >= _FEWEST else grown[:0]
-            if np.array_equal(grown, last):  # one shape comes and goes
+            if np.array_equal(grown, last):  # one shape alternates between in and out
                 return np.intersect1d(grown, core)
             core, last = grown, core
         return core

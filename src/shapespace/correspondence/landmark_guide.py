@@ -1,7 +1,7 @@
-"""Landmarks in a correspondence: the place of each named point on the template, and its pull on a registration.
+"""Landmarks in a correspondence: the position of each named point on the template, and its pull on a registration.
 
 A landmark is a soft constraint. After each step of `register`, the offset between the landmarks of a scan and their
-places on the surface is spread over the surface as a Gaussian process predicts it (C8 of docs/correspondence.md).
+positions on the surface is spread over the surface as a Gaussian process predicts it (C8 of docs/correspondence.md).
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from shapespace.geometry.similarity import fit_similarity
 from shapespace.types import FloatArray, Mesh, Similarity, SurfaceLandmarks
 
 FEWEST = 3
-"""Landmarks: fewer do not determine a pose."""
+"""Number of landmarks: fewer do not determine a pose."""
 _OFF_SHARE = 0.5  # share of the range of deformations that a landmark of the stated uncertainty may move freely
 _AGREE = 0.2
-"""Landmarks whose RMS distance from those of the template, posed, is beyond this share of their spread are others."""
+"""RMS distance of posed landmarks from those of the template, as a share of their spread, that contradicts them."""
 # ratio of landmark distances below which the mirror image is the better match, so that noise does not decide
 _MIRROR_SHARE = 0.5
 _FIRMEST = 1e-3
-"""Two landmarks in one place leave (C8) without a solution where s / a is 0."""
+"""Smallest s / a: with 0, two landmarks in one position leave (C8) without a solution."""
 _SURE = 3.0
-"""Landmarks on a line, but for less than this many times their uncertainty, do not determine its rotation."""
+"""Distance from a line, in units of the uncertainty, below which landmarks do not determine the rotation about it."""
 _LISTED = 3  # landmarks in a sentence
 
 
@@ -40,11 +40,11 @@ class MirroredLandmarksError(InputError):
 
 @dataclass(frozen=True, eq=False)
 class ScanLandmarks:
-    """The landmarks of one scan that the template has too.
+    """Landmarks that scan and template share.
 
     Args:
-        places: on the template, L of them.
-        points: (L, 3) in the scan's frame.
+        places: positions of the L landmarks on the template.
+        points: (L, 3) positions in the scan's frame.
         uncertainty: standard deviation, as a share of the template's size.
     """
 
@@ -54,7 +54,7 @@ class ScanLandmarks:
 
     @staticmethod
     def shared(places: SurfaceLandmarks, scan: Mesh, uncertainty: float) -> ScanLandmarks | None:
-        """Return those that `scan` has of `places`; None where it has none."""
+        """Return those of `places` that `scan` has too; None without shared landmarks."""
         names = [name for name in places.names if name in scan.landmarks]
         if not names:
             return None
@@ -69,11 +69,11 @@ class ScanLandmarks:
         return ScanLandmarks(self.places, self.points * FLIP, self.uncertainty)
 
     def pose(self, vertices: FloatArray) -> Similarity | None:
-        """Return T_scan_template by the landmarks, or None where they are too few, or as good as on a line.
+        """Return T_scan_template from the landmarks; None if they are too few, or nearly on a line.
 
         Raises:
-            MirroredLandmarksError: they are those of a mirror image.
-            InputError: they contradict the template.
+            MirroredLandmarksError: the landmarks are those of a mirror image.
+            InputError: the landmarks contradict the template.
         """
         if len(self.points) < FEWEST:
             return None
@@ -101,7 +101,7 @@ class ScanLandmarks:
         return T
 
     def correction(self, x: FloatArray, harmonics: Harmonics, range_mm: float, size_mm: float) -> FloatArray:
-        """Return (V, 3) the movement (C8) of the surface `x` (V, 3), in whose frame the points must be."""
+        """Return the (V, 3) movement (C8) of the surface `x` (V, 3), in whose frame the points must be."""
         functions = self.places.interpolate(harmonics.functions)
         attenuated = functions * harmonics.attenuation(range_mm)
         kernel = attenuated @ functions.T
@@ -112,7 +112,7 @@ class ScanLandmarks:
         return harmonics.functions @ (attenuated.T @ weights)  # C8
 
     def rms_distance(self, vertices: FloatArray) -> float:
-        """Return the RMS distance between the points and their places on `vertices` (V, 3), in one frame."""
+        """Return the RMS distance between the points and their positions on `vertices` (V, 3), in one frame."""
         return _rms(self.places.interpolate(vertices) - self.points)
 
 
@@ -125,18 +125,18 @@ def stray_landmarks(scan: Mesh) -> dict[str, float]:
 
 
 def with_own_landmarks(scan: Mesh) -> tuple[Mesh, list[str]]:
-    """Return `scan` with the landmarks near its surface, in its frame, and sentences on turned and excluded ones."""
+    """Return `scan` with the landmarks near its surface, in its frame, and sentences on rotated and excluded ones."""
     points, notes = landmarks_in_frame_of(scan, scan.landmarks)
     scan = replace(scan, landmarks=points)
     off = stray_landmarks(scan)
     if not off:
         return scan, [*notes]
     named = ", ".join(f"{name} ({share:.2g} times its size)" for name, share in list(off.items())[:_LISTED])
-    sentence = f"Landmarks that lie far off its surface are left out: {named}."
+    sentence = f"Landmarks that lie far off its surface are excluded: {named}."
     if len(off) == len(points):
         sentence = (
-            f"Its landmarks are left out: they lie {min(off.values()):.2g} times its size off its surface, or more; "
-            "look at their unit and frame."
+            f"Its landmarks are excluded: they lie {min(off.values()):.2g} times its size off its surface, or more; "
+            "check their unit and frame."
         )
     own = {name: point for name, point in points.items() if name not in off}
     return replace(scan, landmarks=own), [*notes, sentence]
@@ -160,11 +160,11 @@ def _rms(difference: FloatArray) -> float:
 
 
 def consensus_landmarks(mean: Mesh, shapes: Sequence[tuple[FloatArray, Mapping[str, FloatArray]]]) -> SurfaceLandmarks:
-    """Return the landmarks of shapes on `mean`: the median of their places on the shapes that agree with most others.
+    """Return the landmarks of shapes on `mean`: the median of their positions on shapes that agree with most others.
 
     Args:
-        mean: with triangles.
-        shapes: (V, 3) vertices of each, and its landmarks in the same frame.
+        mean: mesh with triangles.
+        shapes: (V, 3) vertices of each shape, and its landmarks in the same frame.
     """
     placed = [(place_landmarks(mean.with_vertices(vertices), points), points) for vertices, points in shapes if points]
     names = list(dict.fromkeys(name for _, points in placed for name in points))

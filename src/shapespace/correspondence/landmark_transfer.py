@@ -1,4 +1,4 @@
-"""Landmarks of a few marked specimens, carried to all specimens in dense correspondence, with 90 % regions.
+"""Transfer of the landmarks of a few marked specimens to all specimens in dense correspondence, with 90 % regions.
 
 A landmark of a marked specimen is a point of a triangle, and so has a position on every other surface. The positions
 from all marked specimens are averaged with weights that fall with the squared shape distance. The expected squared
@@ -42,12 +42,12 @@ class TransferredLandmarks:
     """Landmarks predicted on one specimen, in the frame and unit of its surface.
 
     Args:
-        specimen: its name.
-        names: of the L landmarks.
-        positions: (L, 3) on the scan, or on the corresponding surface where no scan was given.
+        specimen: name of the specimen.
+        names: names of the L landmarks.
+        positions: (L, 3) on the scan, or on the corresponding surface if no scan was given.
         radius_90: (L,) radius of the region on the surface that contains the true position with 90 % probability, in
-            the unit of the surface; not-a-number where none is known.
-        on_scan: the same positions in triangles of the scan; `distance_mm` is how far the corresponding surface is.
+            the unit of the surface; not-a-number if unknown.
+        on_scan: the same positions in triangles of the scan; `distance_mm` is that to the corresponding surface.
         reasons: (L,) empty, or why the landmark is doubtful: `unobserved`, `off_scan` or `wide_region`.
 
     Example:
@@ -70,7 +70,7 @@ class TransferredLandmarks:
     ) -> TransferredLandmarks:
         """Return `points` near a corresponding surface on its scan, or on itself.
 
-        `observed` (L,) is the share of the place of each that the scan shows.
+        `observed` (L,) is the share of the surroundings of each point that the scan shows.
         """
         mesh, size = scan or surface, rms_size(surface.vertices)
         on_scan = place_landmarks(Mesh(mesh.vertices, mesh.faces, name=surface.name), points)
@@ -92,12 +92,12 @@ class LandmarkCheck:
     """A given landmark compared with its prediction from all other marked specimens.
 
     Args:
-        specimen: its name.
-        landmark: its name.
+        specimen: name of the specimen.
+        landmark: name of the landmark.
         error: distance from the prediction, in the unit of the specimen.
         error_share: the same as a share of the specimen's RMS size.
-        radius_90: of the prediction.
-        distance: of the given point from the specimen's surface.
+        radius_90: radius of the 90 % region of the prediction.
+        distance: distance of the given point from the specimen's surface.
         finding: empty, `outlier`, or `swapped with NAME`.
 
     Example:
@@ -145,7 +145,7 @@ class MarkedSpecimens:
         """Return the specimens with `marked` landmarks placed on their surfaces.
 
         Args:
-            surfaces: in correspondence, as of `Correspondence.meshes`.
+            surfaces: meshes in correspondence, see `Correspondence.meshes`.
             marked: name of a surface -> name of a landmark -> (3,) in the frame of that surface.
             mirrored: names of the surfaces that are mirror images of the others.
 
@@ -163,7 +163,7 @@ class MarkedSpecimens:
         aligned, mean = align_to_weighted_mean(shapes, np.ones(shapes.shape[:2]), shapes[0])
         size = rms_size(mean)
         flat = aligned.reshape(len(shapes), -1) / (size * np.sqrt(shapes.shape[1]))
-        distance = np.stack([np.linalg.norm(flat - one, axis=1) for one in flat])
+        distance = np.stack([np.linalg.norm(flat - shape, axis=1) for shape in flat])
         placed: dict[int, SurfaceLandmarks] = {}
         for name, points in marked.items():
             mesh = surfaces[index[name]]
@@ -186,7 +186,7 @@ class MarkedSpecimens:
 
         Args:
             specimen: name of its surface.
-            scan: in the frame of the surface; positions are on the corresponding surface without it.
+            scan: scan in the frame of the surface; without it positions are on the corresponding surface.
 
         Raises:
             InputError: no specimen of that name, or no other marked specimen.
@@ -207,9 +207,9 @@ class MarkedSpecimens:
             to_target = self.distance[target, rows] ** 2 + _LEAST_DISTANCE**2
             weights = 1.0 / to_target / (1.0 / to_target).sum()
             on = [sources[i].select([name]) for i in rows]
-            positions[row] = weights @ np.concatenate([one.interpolate(surface.vertices) for one in on])
-            observed[row] = weights @ np.concatenate([one.interpolate(mask) for one in on])
-            variance = factors[row] * (weights @ to_target - 0.5 * weights @ self._squared(rows) @ weights)
+            positions[row] = weights @ np.concatenate([landmark.interpolate(surface.vertices) for landmark in on])
+            observed[row] = weights @ np.concatenate([landmark.interpolate(mask) for landmark in on])
+            variance = factors[row] * (weights @ to_target - 0.5 * weights @ self._variogram(rows) @ weights)
             # The 90 % quantile of F with 2 and `degrees` degrees of freedom, for an isotropic error on the surface.
             quantile = 0.5 * degrees[row] * (0.1 ** (-2.0 / degrees[row]) - 1.0)
             radius[row] = size * np.sqrt(variance * quantile)
@@ -232,7 +232,7 @@ class MarkedSpecimens:
             apart = np.linalg.norm(
                 given.interpolate(mesh.vertices)[:, None] - predicted.positions[rows][None], axis=2
             ).reshape(len(there), len(there))
-            swapped = _swapped(apart)
+            swapped = _find_swapped(apart)
             for k, name in enumerate(there):
                 error, radius = float(apart[k, k]), float(predicted.radius_90[rows[k]])
                 finding = f"swapped with {there[swapped[k]]}" if k in swapped else ""
@@ -240,7 +240,7 @@ class MarkedSpecimens:
                     finding = "outlier"
                 off = float(given.distance_mm[k])
                 checks.append(LandmarkCheck(mesh.name, name, error, error / size, radius, off, finding))
-        return _with_outliers(checks, len(self.landmarks))
+        return _mark_outliers(checks, len(self.landmarks))
 
     def suggest(self, count: int = 5) -> list[tuple[str, float]]:
         """Return the specimens to mark next, best first, each given those before it.
@@ -263,7 +263,7 @@ class MarkedSpecimens:
             chosen.append((self.surfaces[best].name, float(means[best])))
         return chosen
 
-    def _squared(self, rows: IntArray) -> FloatArray:
+    def _variogram(self, rows: IntArray) -> FloatArray:
         """Return (m, m) the variogram without its factor."""
         squared = self.distance[np.ix_(rows, rows)] ** 2 + _LEAST_DISTANCE**2
         np.fill_diagonal(squared, 0.0)
@@ -278,7 +278,7 @@ class MarkedSpecimens:
                 at = np.concatenate([self.landmarks[i].select([name]).interpolate(self.mean) for i in rows])
                 first, second = np.triu_indices(len(rows), 1)
                 squared = ((at[first] - at[second]) ** 2).sum(axis=1)
-                ratios[k] = (squared / self._squared(rows)[first, second]).mean()
+                ratios[k] = (squared / self._variogram(rows)[first, second]).mean()
         usual, several = _USUAL_FACTOR, ratios > 0
         if several.any():
             n = float(np.median(degrees[several]))
@@ -288,8 +288,8 @@ class MarkedSpecimens:
         return (_FACTOR_DEGREES * usual + degrees * ratios) / total, total
 
 
-def _swapped(apart: FloatArray) -> dict[int, int]:
-    """Return index -> index of landmarks whose names are exchanged, by (L, L) distances of given from predicted."""
+def _find_swapped(apart: FloatArray) -> dict[int, int]:
+    """Return index -> index of landmarks whose names are exchanged, from (L, L) distances of given from predicted."""
     straight = apart.diagonal()[:, None] + apart.diagonal()[None]
     ratio = np.where(straight > 0, (apart + apart.T) / np.maximum(straight, 1e-300), 1.0)
     np.fill_diagonal(ratio, 1.0)
@@ -297,11 +297,11 @@ def _swapped(apart: FloatArray) -> dict[int, int]:
     return {k: int(j) for k, j in enumerate(best) if ratio[k, j] <= _SWAPPED and best[j] == k}
 
 
-def _with_outliers(checks: Sequence[LandmarkCheck], specimens: int) -> list[LandmarkCheck]:
-    """Return `checks` with those as outliers whose errors are far beyond those of the landmark and the specimen."""
+def _mark_outliers(checks: Sequence[LandmarkCheck], specimens: int) -> list[LandmarkCheck]:
+    """Return `checks`, marking as outliers those whose errors are far beyond those of the landmark and the specimen."""
     if specimens < _ENOUGH:
         return list(checks)
-    share = np.array([one.error_share for one in checks])
+    share = np.array([check.error_share for check in checks])
 
     def medians(keys: Sequence[str]) -> FloatArray:
         array = np.array(keys)

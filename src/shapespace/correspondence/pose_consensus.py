@@ -1,4 +1,4 @@
-"""Poses on which the comparisons between scans agree, so that no single ambiguous template turns a specimen over (C32).
+"""Poses on which the comparisons between scans agree, so that a single ambiguous template cannot flip a scan (C32).
 
 Each scan is compared with some scans and the template, the anchors, by a pose search. A wrong comparison contradicts
 others: the poses a -> b, b -> c and c -> a do not close. The poses of the scans are those that agree with most
@@ -20,8 +20,8 @@ TEMPLATE = -1
 SAME_POSE_DEG = 35.0
 """Rotation up to which two poses agree: 79 of 84 comparisons between blobs of six kinds were within 36 degrees of the
 truth, and the others beyond 120."""
-_EQUAL = 1e-9  # difference of supports that is rounding
-_STEPS = 10  # passes over all scans at most; poses stop changing after two or three
+_EQUAL = 1e-9  # difference of supports that is rounding error
+_STEPS = 10  # maximum number of passes over all scans; poses stop changing after two or three
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +31,9 @@ class PoseComparison:
     Args:
         anchor: number of the anchor among the scans, or `TEMPLATE`.
         scan: number of the scan.
-        T_scan_anchor: from the frame of the anchor to that of the scan.
-        T_image_anchor: to the frame of the scan's mirror image; None where that was not compared.
+        T_scan_anchor: similarity from the frame of the anchor to that of the scan.
+        T_image_anchor: similarity from the frame of the anchor to that of the scan's mirror image; None if not
+            compared.
     """
 
     anchor: int
@@ -41,10 +42,10 @@ class PoseComparison:
     T_image_anchor: Similarity | None
 
     def between_sides(self, mirrored: Mapping[int, bool]) -> Similarity | None:
-        """Return the pose from the anchor to the scan, each reflected where it is `mirrored`."""
+        """Return the pose from the anchor to the scan, each reflected if it is `mirrored`."""
         reflected = mirrored[self.anchor]
         T = self.T_scan_anchor if mirrored[self.scan] == reflected else self.T_image_anchor
-        return T if T is None or not reflected else _conjugated(T)
+        return T if T is None or not reflected else _mirror_pose(T)
 
 
 def angle_deg(a: Similarity, b: Similarity) -> float:
@@ -57,22 +58,22 @@ def consensus_poses(comparisons: Sequence[PoseComparison], mirrored: Mapping[int
     """Return for each scan the pose of the template in it that agrees with most comparisons (C32).
 
     Args:
-        comparisons: of scans with anchors, the template among them.
-        mirrored: which scans are reflected, by their number; of the template whether it was reflected after the
+        comparisons: comparisons of scans with anchors, the template among them.
+        mirrored: whether each scan is reflected, by its number; for the template whether it was reflected after the
             comparisons. Poses are those of the reflected scans and template.
     """
     edges: dict[int, list[tuple[int, Similarity]]] = {TEMPLATE: []}
-    for one in comparisons:
-        T = one.between_sides(mirrored)
-        if T is not None and one.anchor != one.scan:
-            edges.setdefault(one.scan, []).append((one.anchor, T))
-            edges.setdefault(one.anchor, []).append((one.scan, T.inverse()))
-    anchors = sorted({one.anchor for one in comparisons} & edges.keys())
+    for comparison in comparisons:
+        T = comparison.between_sides(mirrored)
+        if T is not None and comparison.anchor != comparison.scan:
+            edges.setdefault(comparison.scan, []).append((comparison.anchor, T))
+            edges.setdefault(comparison.anchor, []).append((comparison.scan, T.inverse()))
+    anchors = sorted({comparison.anchor for comparison in comparisons} & edges.keys())
     order = [*anchors, *sorted(edges.keys() - set(anchors))]
     solutions = [_poses_from(root, order, edges) for root in anchors]
     if not solutions:
         return {}
-    poses = max(solutions, key=lambda poses: sum(_agreement(poses, edges, i)[2] for i in order))
+    poses = max(solutions, key=lambda poses: sum(_find_support(poses, edges, i)[2] for i in order))
     gauge = poses.pop(TEMPLATE).inverse()
     return {i: T @ gauge for i, T in poses.items()}
 
@@ -80,12 +81,12 @@ def consensus_poses(comparisons: Sequence[PoseComparison], mirrored: Mapping[int
 def _poses_from(
     root: int, order: Sequence[int], edges: Mapping[int, Sequence[tuple[int, Similarity]]]
 ) -> dict[int, Similarity]:
-    """Return poses that begin with the comparisons with one anchor; each becomes the one that most others support."""
+    """Return poses from the comparisons with one anchor, each then replaced by the one that most others support."""
     poses = {root: Similarity.identity()} | dict(edges[root])
     for _ in range(_STEPS):
         is_changed = False
         for i in order:
-            support, proposed, own = _agreement(poses, edges, i)
+            support, proposed, own = _find_support(poses, edges, i)
             if i != root and len(support) and support.max() > own + _EQUAL:
                 poses[i] = proposed[int(support.argmax())]
                 is_changed = True
@@ -94,7 +95,7 @@ def _poses_from(
     return poses
 
 
-def _agreement(
+def _find_support(
     poses: Mapping[int, Similarity], edges: Mapping[int, Sequence[tuple[int, Similarity]]], i: int
 ) -> tuple[FloatArray, list[Similarity], float]:
     """Return the support of each pose that neighbours propose for `i`, these poses, and the support of its own."""
@@ -107,11 +108,11 @@ def _agreement(
 
 
 def _support(trace: FloatArray) -> FloatArray:
-    """Return how much poses support each other, from 1 if they are equal to 0 where they do not agree."""
+    """Return the support of poses for each other, from 1 if they are equal to 0 if they do not agree."""
     limit = 1 + 2 * np.cos(np.radians(SAME_POSE_DEG))
     return np.clip((trace - limit) / (3 - limit), 0.0, 1.0)
 
 
-def _conjugated(T: Similarity) -> Similarity:
-    """Return the pose between the mirror images of what `T` is between."""
+def _mirror_pose(T: Similarity) -> Similarity:
+    """Return the pose `T` as seen in the mirror images of its two frames."""
     return Similarity(T.scale, FLIP[:, None] * T.rotation * FLIP, T.translation * FLIP)

@@ -1,10 +1,10 @@
-"""One scan registered to a template: forces from both sides, averaged over the surface and never fitted.
+"""Elastic registration of a template to a scan: forces in both directions, averaged over the surface.
 
-Viscous and elastic, as White et al. (2019) have it. In each iteration every point of the template is drawn to the scan
+Viscous and elastic, as in White et al. (2019). In each iteration every point of the template is drawn to the scan
 and by the scan (C3, C4), outliers are down-weighted (C5), and the forces are averaged over a range of the surface (C6)
-and added to the movement, which is smoothed over the same range (C7). The range falls from a good part of the object to
-its details. A force that is averaged does not pull a smooth field through every match, as a fit would; that is why
-matches that are wrong sideways, as most are at first, do so little harm here. Equations Cn are those of
+and added to the movement, which is smoothed over the same range (C7). The range decreases from a large part of the
+object to its details. An averaged force does not pull a smooth field through every match, as a fit would; therefore
+matches with a tangential error, as most have at first, do little harm. Equations Cn are those of
 docs/correspondence.md.
 """
 
@@ -26,7 +26,7 @@ from shapespace.geometry.similarity import fit_similarity
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
 
 _NEAR = 3
-"""Points of the other side that a point is matched with, by inverse squared distance."""
+"""Number of points of the other side that a point is matched with, by inverse squared distance."""
 _TOUCHING = 1e-8
 """Square of a length, mm^2, so that a point that touches another one has a finite weight."""
 _OUTLIER_ROUNDS = 4  # reweighting iterations for outliers
@@ -34,23 +34,24 @@ _OUTLIER_ROUNDS = 4  # reweighting iterations for outliers
 
 @dataclass(frozen=True)
 class ElasticSettings:
-    """How a scan is registered; lengths are shares of the template's size (RMS distance from its middle).
+    """Settings of a registration; lengths are shares of the template's size (RMS distance from its centre).
 
     Args:
-        harmonics: functions that the movement is made of.
-        widest: range of (C6) in the first iteration,
-        narrowest: and in the last; it falls geometrically.
-        iterations: of these many.
-        points: of each side that are matched while the range is wide; all are below `fine` of the widest.
-        normal_cosine: matches whose normals differ more are none.
-        inliers: residuals beyond this many standard deviations are likelier wrong than right.
-        borders: whether what is matched with a border counts.
-        floor: share of full weight below which nothing is seen, and the average fades.
-        turn: length that a difference of the normals by a radian, or so, counts as much as.
-        colour: length that a difference between black and a full red, green or blue counts as much as, where template
+        harmonics: number of functions of which the movement consists.
+        widest: range of (C6) in the first iteration.
+        narrowest: range of (C6) in the last iteration; it decreases geometrically.
+        iterations: number of iterations.
+        points: number of points of each side that are matched while the range is wide; all are matched below `fine` of
+            the widest range.
+        normal_cosine: cosine of the angle between normals beyond which matches are excluded.
+        inliers: number of standard deviations beyond which residuals are more likely wrong than right.
+        borders: whether matches with a border count.
+        floor: share of full weight below which a point counts as unobserved, and the average fades.
+        turn: length that a difference of the normals by about a radian counts as.
+        colour: length that a difference between black and a full red, green or blue counts as, if template
             and scan have colours; 0 ignores them.
-        tangential: forces along the surface are averaged over this range at least: over shorter ones they are noise of
-            the triangles, and move points away from the correct places that they had.
+        tangential: smallest range over which forces along the surface are averaged: over shorter ranges they are noise
+            of the triangles, and move points away from their correct positions.
     """
 
     harmonics: int = 400
@@ -73,10 +74,10 @@ class Template:
     """The surface that scans are registered to.
 
     Args:
-        mesh: its triangles; its vertices in mm are where a registration begins.
-        topology: of the triangles.
-        harmonics: its smooth functions.
-        size_mm: RMS distance from its middle.
+        mesh: triangles, and vertices in mm, from which a registration begins.
+        topology: topology of the triangles.
+        harmonics: harmonics of the surface.
+        size_mm: RMS distance of the vertices from their centre.
     """
 
     mesh: Mesh
@@ -86,7 +87,7 @@ class Template:
 
     @staticmethod
     def of(mesh: Mesh, harmonics: Harmonics | int) -> Template:
-        """Return `mesh` with data for registrations: that many functions of its own, or those of a similar surface."""
+        """Return `mesh` with data for registrations: that many harmonics of its own, or those of a similar surface."""
         functions = harmonics if isinstance(harmonics, Harmonics) else Harmonics.of(mesh, harmonics)
         return Template(mesh, Topology.of(mesh), functions, rms_size(mesh.vertices))
 
@@ -96,8 +97,8 @@ class ElasticState:
     """The template in one iteration of its registration to a scan, and the result of the last iteration.
 
     Args:
-        vertices: (V, 3) in the template's frame.
-        T_scan_template: to the scan's mm frame.
+        vertices: (V, 3) vertices in the template's frame.
+        T_scan_template: similarity from the template's frame to the scan's mm frame.
     """
 
     vertices: FloatArray
@@ -106,16 +107,16 @@ class ElasticState:
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """What no iteration changes.
+    """Constants of all iterations.
 
     Args:
         template: the surface.
         target: the scan in its mm frame.
-        base: (V, 3) the shape without movement, in the template's frame.
-        landmarks: of the scan, in its mm frame.
-        settings: of the registration.
-        colours: (V, 3) of the template and (S, 3) of the scan, lengths in mm about their medians; without columns where
-            either has none.
+        base: (V, 3) shape without movement, in the template's frame.
+        landmarks: landmarks of the scan, in its mm frame.
+        settings: settings of the registration.
+        colours: (V, 3) colours of the template and (S, 3) of the scan, as lengths in mm about their medians; without
+            columns if either has no colours.
     """
 
     template: Template
@@ -131,10 +132,10 @@ class _Samples:
     """Points of one surface that are matched with the other one, in the template's frame.
 
     Args:
-        points: (M, 3) mm.
-        normals: (M, 3), zero where the surface has no triangles.
-        on_border: (M,) whether they are on the border of the surface.
-        colours: (M, 3), as lengths in mm; (M, 0) where the surface or the other one has none.
+        points: (M, 3) positions, mm.
+        normals: (M, 3) normals, zero if the surface has no triangles.
+        on_border: (M,) whether the points are on the border of the surface.
+        colours: (M, 3) colours as lengths in mm; (M, 0) if the surface or the other one has no colours.
     """
 
     points: FloatArray
@@ -153,19 +154,19 @@ def register(
     landmarks: ScanLandmarks | None = None,
     seed: int = 0,
 ) -> ElasticState:
-    """Return the template moved onto the scan, all of it: where the scan shows nothing, as its neighbours move.
+    """Return the template moved onto the scan; where the scan shows nothing, the template moves as its neighbours do.
 
     Args:
         template: the surface.
         target: the scan in its mm frame.
-        T_scan_template: where to begin.
-        settings: how.
-        expected: (V, 3) the shape that the scan is thought to have, in the template's frame; None is the template.
-        landmarks: of the scan, in its mm frame.
-        seed: of the points that are matched.
+        T_scan_template: initial pose, from the template's frame to the scan's mm frame.
+        settings: settings of the registration.
+        expected: (V, 3) expected shape of the scan, in the template's frame; None is the template.
+        landmarks: landmarks of the scan, in its mm frame.
+        seed: seed of the sample of points that are matched.
     """
     base = np.array(template.mesh.vertices if expected is None else expected)
-    colours = _colours(template, target, settings)
+    colours = _colour_lengths(template, target, settings)
     problem = _Problem(template, target, base, landmarks, settings, colours)
     state, rng = ElasticState(base, T_scan_template), np.random.default_rng(seed)
     for range_share in np.geomspace(settings.widest, settings.narrowest, settings.iterations):
@@ -179,10 +180,12 @@ def _step(problem: _Problem, state: ElasticState, range_share: float, rng: np.ra
     harmonics, size_mm = template.harmonics, template.size_mm
     range_mm = range_share * size_mm
     x, T = state.vertices, state.T_scan_template
-    own, surface, scan = _samples(problem, state, range_share > settings.fine * settings.widest, rng)
-    force, weight = _forces(surface, scan, settings, size_mm)
+    own, surface, scan = _sample_points(problem, state, range_share > settings.fine * settings.widest, rng)
+    force, weight = _compute_forces(surface, scan, settings, size_mm)
     weight = weight * _inlier_probability(force, weight, settings.inliers, size_mm)
-    x = x + _averaged(harmonics, own, _parts(force, surface.normals, range_share, settings), weight, settings, size_mm)
+    x = x + _average_forces(
+        harmonics, own, _split_forces(force, surface.normals, range_share, settings), weight, settings, size_mm
+    )
     pose = fit_similarity(problem.base, x)
     T, x = T @ pose, pose.inverse().apply(x)
     x = problem.base + harmonics.diffused(x - problem.base, range_mm)  # C7
@@ -191,8 +194,8 @@ def _step(problem: _Problem, state: ElasticState, range_share: float, rng: np.ra
     return ElasticState(x, T)
 
 
-def _colours(template: Template, target: ScanTarget, settings: ElasticSettings) -> tuple[FloatArray, FloatArray]:
-    """Return the colours as lengths, without what a whole surface has in common, such as its light."""
+def _colour_lengths(template: Template, target: ScanTarget, settings: ElasticSettings) -> tuple[FloatArray, FloatArray]:
+    """Return the colours as lengths, about the medians of each surface, which removes differences in lighting."""
     own, scan = template.mesh.colours, target.mesh.colours
     if own is None or scan is None or not settings.colour:
         return np.empty((len(template.mesh.vertices), 0)), np.empty((len(target.mesh.vertices), 0))
@@ -200,7 +203,7 @@ def _colours(template: Template, target: ScanTarget, settings: ElasticSettings) 
     return scale * (own - np.median(own, axis=0)), scale * (scan - np.median(scan, axis=0))
 
 
-def _samples(
+def _sample_points(
     problem: _Problem, state: ElasticState, coarse: bool, rng: np.random.Generator
 ) -> tuple[IntArray, _Samples, _Samples]:
     """Return the vertices (M,) of the template that are matched, with their points, and points of the scan."""
@@ -219,10 +222,10 @@ def _samples(
     return own, surface, scan
 
 
-def _forces(
+def _compute_forces(
     surface: _Samples, scan: _Samples, settings: ElasticSettings, size_mm: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return forces (M, 3), mm, on the points of the surface, and their weights (M,): 1 for each side that is sure."""
+    """Return forces (M, 3), mm, on the points of the surface, and their weights (M,): 1 for each certain side."""
     x, y, count = surface.points, scan.points, len(surface.points)
     is_cloud = not scan.normals.any()
     turn = settings.turn * size_mm
@@ -239,7 +242,7 @@ def _forces(
     if not settings.borders:
         is_valid &= ~scan.on_border[near].any(axis=1)
         back_is_valid &= ~surface.on_border[back].any(axis=1)
-    # Each side counts alike, however densely it is sampled.
+    # Both sides have equal weight, however densely they are sampled.
     back_weight = (back_share * back_is_valid[:, None]).ravel() * (count / len(y))
     weight = is_valid + np.bincount(back.ravel(), back_weight, count)
     by_scan = np.stack(
@@ -268,7 +271,7 @@ def _inlier_probability(force: FloatArray, weight: FloatArray, inliers: float, s
     return probability
 
 
-def _parts(
+def _split_forces(
     force: FloatArray, normals: FloatArray, range_share: float, settings: ElasticSettings
 ) -> list[tuple[float, FloatArray]]:
     """Return the parts of the forces that are averaged over different ranges, shares of the size."""
@@ -278,7 +281,7 @@ def _parts(
     return [(range_share, normal), (settings.tangential, force - normal)]
 
 
-def _averaged(
+def _average_forces(
     harmonics: Harmonics,
     own: IntArray,
     parts: Sequence[tuple[float, FloatArray]],
@@ -286,7 +289,7 @@ def _averaged(
     settings: ElasticSettings,
     size_mm: float,
 ) -> FloatArray:
-    """Return (V, 3) the average (C6) of forces at the vertices `own`, everywhere: each part over its range."""
+    """Return (V, 3) the average (C6) at all vertices of forces at the vertices `own`: each part over its range."""
     functions, area = harmonics.functions[own], harmonics.area[own]
     area = area * (harmonics.area.sum() / area.sum())
     columns = [np.column_stack([weight[:, None] * force, weight]) for _, force in parts]
@@ -296,4 +299,4 @@ def _averaged(
         for (range_share, _), own_coefficients in zip(parts, coefficients, strict=True)
     ]
     diffused = np.split(harmonics.functions @ np.hstack(smooth), len(parts), axis=1)
-    return np.sum([one[:, :3] / np.maximum(one[:, 3:], settings.floor) for one in diffused], axis=0)  # C6
+    return np.sum([part[:, :3] / np.maximum(part[:, 3:], settings.floor) for part in diffused], axis=0)  # C6

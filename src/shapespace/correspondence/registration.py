@@ -36,38 +36,38 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, ByteArray, FloatArray, IntArray, Mesh, Similarity
 
 REACHED = 0.03
-"""A scan's point is covered when the surface is this near, as a share of the size."""
-_ALTERNATIVES = 3  # poses that are registered; each costs a whole registration
+"""Distance of a scan's point from the surface, as a share of the size, up to which the point is covered."""
+_ALTERNATIVES = 3  # largest number of poses that are registered; each costs a complete registration
 _AS_GOOD = 0.8
-"""Poses are all tried whose score times this is no worse than the best one's."""
+"""Ratio of the best score to that of another pose, from which on the other pose is tried too."""
 _LEFT_OVER = 0.05  # share of the scan covered; registrations within it of the best count as equally complete
 _BETTER_POSE = 0.95
-"""A pose that the search with the modes of the other scans makes likelier than all others is tried beside the known."""
+"""Ratio of scores below which a pose of the search with the modes of other scans is tried in addition to the known."""
 _OTHER_SIZE = 8.0
-"""Units differ by more, and what a scan shows beside the object hardly does."""
+"""Ratio of sizes, by landmarks and by vertices, that shows another unit; other objects in a scan change it by less."""
 _OTHER_FRAME = 0.75
 """A pose of the search whose score is below this ratio of that near the frame of the file shows that the frame is
-another one: of 26 molars in their own frames it is so for the four that landmarks show to be rotated by 60 degrees or
-more, and for no other."""
+another one: of 26 molars in their own frames this is true for the four that landmarks show to be rotated by 60 degrees
+or more, and for no other."""
 _CONTRADICTED = 2.0
-"""Landmarks too few for a pose rule poses out in which they lie this many times as far off as in another."""
+"""Ratio of landmark distances above which too few landmarks for a pose exclude a pose, compared with another pose."""
 _SAME_TURN_TRACE = 1 + 2 * np.cos(np.radians(40.0))
 _EITHER_SIDE = 1.05
 """Ratio of the scores of a scan and its mirror image up to which both are registered: it was 1.01 or more for 26 molars
 of the majority, against the mean of all, and 0.98 or less for 13 mirrored ones."""
 _STRAINED = 0.0009
 """Mean distance from the scan, share of the size, times RMS log stretch of edges, beyond which limbs may be missing or
-exchanged: 3 of 59 faces, femora, molars, spleens and blobs, whole or damaged, had more (two cut femora and a blob), and
-13 of 50 figures with moving limbs, of which the others had at most 0.0007."""
+exchanged: 3 of 59 faces, femora, molars, spleens and blobs, complete or damaged, had more (two cut femora and a blob),
+and 13 of 50 figures with moving limbs, of which the others had at most 0.0007."""
 CLEARLY_LESS_STRAINED = 0.7
-"""Ratio of this strain below which a registration from a map along the surface replaces another one. Of an object that
-is known to bend, relief alone chooses: the registration from its own surface of the last round has the least strain."""
+"""Ratio of this strain below which a registration from a map along the surface replaces another one. For an object that
+is known to bend, relief alone decides: the registration from its own surface of the last round has the least strain."""
 _UNREACHED = "surface not reached: too little of the scan matches the template from any pose"
 _BULGING = 0.2
-"""How far the normals of a sheet point away from its middle, 0 to 1, when it is clear which way it bulges."""
-_FEW_HARMONICS = 4  # slowest harmonics: the pose model before any shapes are known may only stretch and bend
+"""Degree, 0 to 1, to which the normals of a sheet point away from its centre, from which its outside is clear."""
+_FEW_HARMONICS = 4  # slowest harmonics: without known shapes the pose model may only stretch and bend
 _GUIDE_CONFIG = FitConfig(unit="mm", scale="free")
-_MEASURED = 20_000  # points of a scan that distances are measured at: an error below 1 % of their mean
+_MEASURED = 20_000  # points of a scan at which distances are measured: an error below 1 % of their mean
 Comparison: TypeAlias = Literal["as given", "one", "pose", "scores", "both"]
 _Distances: TypeAlias = tuple[float, float, float, float]
 _FAR: _Distances = (np.inf, np.inf, np.inf, np.inf)
@@ -77,8 +77,8 @@ class PoseScores(NamedTuple):
     """Scores of poses of one scan, shares of the template's size.
 
     Args:
-        pose: of its pose.
-        mirrored: of the best pose of its mirror image.
+        pose: score of the pose of the scan.
+        mirrored: score of the best pose of its mirror image.
     """
 
     pose: float
@@ -90,25 +90,25 @@ class RegistrationTask:
     """The registration of one scan.
 
     Args:
-        index: of the scan.
-        scan: repaired, in its own frame and unit.
-        T_scan_template: where the template lies in it; None searches all poses.
-        expected: (V, 3) the shape to begin from, in the template's frame; None is the template.
-        settings: of the registration.
-        pose_model: which of the context's pose models is trained without this scan.
-        landmarks: of the scan, in its own frame; None where it has none.
-        mirrored: whether `scan` and `landmarks` are the mirror image of what is in the file.
-        sides: whether the scan is compared with its mirror image: never, by its landmarks alone, by the scores of the
-            pose search (nothing is registered), or by scores and registrations where the scores are about equal; or
-            whether poses alone are compared, and nothing is registered.
-        pose: poses that are searched; for mirror images and comparisons of scores all.
-        other_pose: from which the scan is registered too; None if there is no other one.
+        index: index of the scan.
+        scan: the repaired scan, in its own frame and unit.
+        T_scan_template: pose of the template in the scan's frame; None searches all poses.
+        expected: (V, 3) the initial shape, in the template's frame; None is the template.
+        settings: settings of the registration.
+        pose_model: index of the context's pose model that was trained without this scan.
+        landmarks: landmarks of the scan, in its own frame; None without landmarks.
+        mirrored: whether `scan` and `landmarks` are the mirror image of those in the file.
+        sides: comparison of the scan with its mirror image: never, by its landmarks alone, by the scores of the
+            pose search (nothing is registered), or by scores and registrations if the scores are about equal; or
+            of poses alone, with nothing registered.
+        pose: range of poses that are searched; for mirror images and comparisons of scores all.
+        other_pose: additional pose from which the scan is registered; None without such a pose.
         bent: whether `expected` is the scan's own surface of the last round, so that no pose is searched.
         is_start_known: whether it is registered from `T_scan_template` and `expected` alone.
-        from_all_poses: whether it is registered from all likely poses, and where sides are compared also as its mirror
+        from_all_poses: whether it is registered from all likely poses, and, if sides are compared, also as its mirror
             image.
-        symmetries: (S, V) near symmetries of the object, as `ScanRegistration.symmetries` has them: a bent scan is
-            registered from its own surface after each of them, too.
+        symmetries: (S, V) near symmetries of the object, see `ScanRegistration.symmetries`: a bent scan is also
+            registered from its own surface after each symmetry.
     """
 
     index: int
@@ -141,25 +141,26 @@ class ScanRegistration:
     """The template registered to one scan.
 
     Args:
-        index: of the scan.
-        vertices: (V, 3) in the template's frame.
-        T_scan_template: to the scan's own frame.
-        observed: (V,) which vertices the scan shows.
+        index: index of the scan.
+        vertices: (V, 3) vertices in the template's frame.
+        T_scan_template: similarity from the template's frame to the scan's own frame.
+        observed: (V,) True where the scan shows the vertex.
         covered: share of the scan's points that the surface covers.
         distance: (4,) mean, 95 %, 99 % and largest distance both ways, in the template's unit.
-        cpu_s: CPU time.
-        reason: why the registration failed; empty where it did not. The arrays of a failed one are the template's.
-        alternatives: the registrations from other poses that are about as likely.
-        mirrored: whether it is that of the mirror image of the scan.
-        scores: of the pose search, shares of the template's size; not-a-number where nothing was compared.
+        cpu_s: CPU time, seconds.
+        reason: why the registration failed; empty if it did not. The arrays of a failed registration are those of the
+            template.
+        alternatives: registrations from other poses that are about equally likely.
+        mirrored: whether it is the registration of the scan's mirror image.
+        scores: scores of the pose search, shares of the template's size; not-a-number if nothing was compared.
         posed_by_landmarks: whether the landmarks determine the pose.
         stretch: RMS log ratio of its edges to those of the template, the change of size removed.
-        bent: whether it began at a map along the surface, as of an object whose limbs have moved.
-        colours: (V, 3) uint8 of the scan at the vertices; None where it has none.
-        relief_gap: by how much its relief agrees better with the template's than that from any other map along the
-            surface; infinite where there is none.
-        symmetries: (S, V) for each other map along the surface, where it has each vertex: the number of the vertex that
-            this surface has there; None where there is no other map.
+        bent: whether it began at a map along the surface, for an object whose limbs have moved.
+        colours: (V, 3) uint8 colours of the scan at the vertices; None without colours.
+        relief_gap: agreement of its relief with the template's minus that from the best other map along the surface;
+            infinite without another map.
+        symmetries: (S, V) index of the vertex of this surface at the position of each vertex, for each other map along
+            the surface; None if there is no other map.
     """
 
     index: int
@@ -182,25 +183,25 @@ class ScanRegistration:
 
     @property
     def vertices_on_scan(self) -> FloatArray:
-        """(V, 3) the vertices in the scan's own frame."""
+        """(V, 3) vertices in the scan's own frame."""
         return self.T_scan_template.apply(self.vertices)
 
     @property
     def strain(self) -> float:
-        """Distance from the scan times stretch of the edges: large if a limb was not reached, or another one was."""
+        """Distance from the scan times stretch of the edges: large if a limb was missed or exchanged with another."""
         return self.distance[0] * self.stretch
 
 
 @dataclass(frozen=True, eq=False)
 class RoundContext:
-    """What all tasks of a round share.
+    """Shared input of all tasks of a round.
 
     Args:
         mesh: the template.
-        harmonics: its smooth functions.
-        pose_models: for the pose search: one, or one for each part of the scans, trained without that part.
-        seed: of all random draws.
-        guide: a model whose mean is the template; its fit is where a scan without a prediction begins.
+        harmonics: harmonics of the template.
+        pose_models: pose models for the search: one, or one for each part of the scans, trained without that part.
+        seed: seed of all random choices.
+        guide: a model whose mean is the template; a scan without a prediction begins at its fit.
     """
 
     mesh: Mesh
@@ -216,12 +217,12 @@ class RoundContext:
 
     @cached_property
     def model(self) -> ShapeModel:
-        """The template as a shape model, of which the dense stage uses the mean alone."""
+        """The template as a shape model, of which the dense stage uses only the mean."""
         return generic_model(self.mesh, self.harmonics.slowest(_FEW_HARMONICS))
 
     @cached_property
     def intrinsic(self) -> IntrinsicShape:
-        """The template by quantities that bending does not change."""
+        """Intrinsic shape of the template, which bending does not change."""
         return IntrinsicShape.of(self.mesh, self.harmonics)
 
     @cached_property
@@ -257,7 +258,7 @@ class RoundContext:
             reason=reason,
         )
 
-    # Which pose
+    # Choice of the pose
 
     def _register(self, task: RegistrationTask) -> ScanRegistration:
         if task.bent and task.T_scan_template is not None:
@@ -272,19 +273,21 @@ class RoundContext:
                 pose = None if task.landmarks is None else task.landmarks.pose(self.mesh.vertices)
             if pose is not None:
                 return self._register_by_landmarks(task, pose)
-        start = self._search(task)
+        start = self._search_pose(task)
         if task.sides in ("one", "as given"):
             return self._register_side(task, start)
         other = task.reflected()
-        mirrored = self._search(other)
+        mirrored = self._search_pose(other)
         likely = [
-            (one, at)
-            for one, at in ((task, start), (other, mirrored))
+            (side, at)
+            for side, at in ((task, start), (other, mirrored))
             if task.from_all_poses
-            or one.T_scan_template is not None
+            or side.T_scan_template is not None
             or at.score_mm <= _EITHER_SIDE * min(start.score_mm, mirrored.score_mm)
         ]
-        registered = [one for one in (self._try_side(*side) for side in likely) if one is not None]
+        registered = [
+            registration for registration in (self._try_side(*side) for side in likely) if registration is not None
+        ]
         if not registered:
             raise FitError(_UNREACHED)
         first, *others = registered
@@ -329,14 +332,14 @@ class RoundContext:
                 candidates.append(replace(bent, bent=True))
         if not candidates:
             return registration
-        agreements = [self._relief_agreement(one) for one in candidates]
+        agreements = [self._relief_agreement(candidate) for candidate in candidates]
         highest = max(agreements)
         best = candidates[agreements.index(highest)]
         own, size_mm = best.vertices_on_scan, rms_size(task.scan.vertices)
         others = [
-            (highest - value, one.vertices_on_scan)
-            for one, value in zip(candidates, agreements, strict=True)
-            if is_apart(one.vertices_on_scan, own, size_mm)
+            (highest - value, candidate.vertices_on_scan)
+            for candidate, value in zip(candidates, agreements, strict=True)
+            if is_apart(candidate.vertices_on_scan, own, size_mm)
         ]
         if not others:
             return best
@@ -347,22 +350,22 @@ class RoundContext:
     def _shapes_by_map(self, task: RegistrationTask, registration: ScanRegistration) -> list[FloatArray]:
         """Return the distinct shapes (V, 3) in the scan's frame by maps along the surface.
 
-        Of an object that is known to bend, they include its own surface after each near symmetry.
+        For an object that is known to bend, they include its own surface after each near symmetry.
         """
         own = registration.vertices_on_scan
         symmetries = task.symmetries if task.bent and task.symmetries is not None else ()
         shapes = [self.intrinsic.smooth(own[symmetry]) for symmetry in symmetries]
-        with suppress(ShapespaceError):  # no sheet of triangles
+        with suppress(ShapespaceError):  # the triangles do not form a sheet
             shapes += bent_shapes(self.intrinsic, IntrinsicShape.of_scan(task.scan), self.seed)
         known = [own] if task.bent else []
         return distinct(shapes, rms_size(task.scan.vertices), known)
 
     def _relief_agreement(self, registration: ScanRegistration) -> float:
-        """Return how well the relief of a surface agrees with that of the template (C35)."""
+        """Return the agreement of the relief of a surface with that of the template (C35)."""
         own = relief(registration.vertices, self.mesh, self.harmonics)
         return agreement(own, self.template_relief, self.harmonics.area * registration.observed)
 
-    def _search(self, task: RegistrationTask) -> Start:
+    def _search_pose(self, task: RegistrationTask) -> Start:
         vertices = np.array(task.scan.vertices)
         model, pose = self.pose_models[task.pose_model], "search" if task.mirrored else task.pose
         start = model.search(vertices, self.seed, pose=pose)
@@ -372,7 +375,7 @@ class RoundContext:
                 degrees = angle_deg(best.T_scan_model, Similarity.identity())
                 raise FitError(
                     f"the frame of its file is rotated by about {degrees:.0f} degrees from those of the others; rotate "
-                    "it, or leave --pose out"
+                    "it, or omit --pose"
                 )
         return start
 
@@ -385,7 +388,7 @@ class RoundContext:
     def _register_by_landmarks(self, task: RegistrationTask, pose: Similarity) -> ScanRegistration:
         ratio = pose.scale * rms_size(self.mesh.vertices) / rms_size(task.scan.vertices)
         if not 1 / _OTHER_SIZE < ratio < _OTHER_SIZE:
-            raise InputError(f"its landmarks are those of an object {ratio:.2g} times its size; look at their unit")
+            raise InputError(f"its landmarks are those of an object {ratio:.2g} times its size; check their unit")
         T = task.T_scan_template
         if T is None or not _is_same_rotation(T, pose):
             task, T = self._with_guide_fit(replace(task, expected=None), pose)
@@ -404,45 +407,45 @@ class RoundContext:
         others = likely_starts(start) if task.from_all_poses else others
         others += [] if task.other_pose is None else [Start(task.other_pose, "given", np.nan)]
         tried = [
-            self._try(replace(task, expected=None), one)
-            for one in others
-            if not _is_same_rotation(T, one.T_scan_model)
-            and self._landmark_distance(task, one.T_scan_model) <= _CONTRADICTED * self._landmark_distance(task, T)
+            self._try_start(replace(task, expected=None), other)
+            for other in others
+            if not _is_same_rotation(T, other.T_scan_model)
+            and self._landmark_distance(task, other.T_scan_model) <= _CONTRADICTED * self._landmark_distance(task, T)
         ]
-        return replace(registration, alternatives=tuple(one for one in tried if one is not None))
+        return replace(registration, alternatives=tuple(other for other in tried if other is not None))
 
     def _register_from_search(self, task: RegistrationTask, start: Start) -> ScanRegistration:
-        """Register from each likely pose of the search; those that cover about as much are alternatives."""
+        """Register from each likely pose of the search; registrations that cover about as much are alternatives."""
         starts = likely_starts(start)
-        distances = [self._landmark_distance(task, one.T_scan_model) for one in starts]
+        distances = [self._landmark_distance(task, likely.T_scan_model) for likely in starts]
         nearest = min(distances)
         tried = [
-            self._try(task, one)
-            for one, distance in zip(starts, distances, strict=True)
+            self._try_start(task, likely)
+            for likely, distance in zip(starts, distances, strict=True)
             if distance <= _CONTRADICTED * nearest
         ]
-        registered = [one for one in tried if one is not None]
+        registered = [registration for registration in tried if registration is not None]
         if not registered:
             raise FitError(_UNREACHED)
-        # By how near it comes a smooth object fits in wrong poses too, so the search decides, unless much is left over.
-        most = max(one.covered for one in registered)
-        first, *others = [one for one in registered if one.covered > most - _LEFT_OVER]
+        # A smooth object is near the scan in wrong poses too, so the search decides, unless much is not covered.
+        most = max(registration.covered for registration in registered)
+        first, *others = [registration for registration in registered if registration.covered > most - _LEFT_OVER]
         return replace(first, alternatives=tuple(others))
 
     def _landmark_distance(self, task: RegistrationTask, T: Similarity) -> float:
-        """Return the RMS distance of the landmarks in a pose, in the template's unit; 0 where there are none."""
+        """Return the RMS distance of the landmarks in a pose, in the template's unit; 0 without landmarks."""
         if task.landmarks is None:
             return 0.0
         return task.landmarks.transformed(T.inverse()).rms_distance(self.mesh.vertices)
 
-    def _try(self, task: RegistrationTask, start: Start) -> ScanRegistration | None:
+    def _try_start(self, task: RegistrationTask, start: Start) -> ScanRegistration | None:
         try:
             return self._register_at(*self._with_guide_fit(task, start.T_scan_model))
         except (FitError, InputError):
             return None
 
     def _with_guide_fit(self, task: RegistrationTask, T: Similarity) -> tuple[RegistrationTask, Similarity]:
-        """Return task and pose with the guide's fit from `T`, where there is no prediction and the fit converges."""
+        """Return task and pose with the guide's fit from `T`, if there is no prediction and the fit converges."""
         if self.guide is None or task.expected is not None:
             return task, T
         scan = task.scan.with_vertices(T.inverse().apply(task.scan.vertices))
@@ -452,7 +455,7 @@ class RoundContext:
         shape = np.asarray(self.guide.reconstruct(fit.b), dtype=np.float64)
         return replace(task, expected=shape), T @ fit.T_scan_model
 
-    # From one pose
+    # Registration from one pose
 
     def _register_at(self, task: RegistrationTask, T: Similarity) -> ScanRegistration:
         """Register from the pose `T`: elastic registration, then the details by the dense stage of a fit."""
@@ -470,8 +473,8 @@ class RoundContext:
         start = elastic.T_scan_template.apply(elastic.vertices)
         dense = dense_surface(self.model, target, start, elastic.T_scan_template, DenseSettings(seed=self.seed))
         nearest = target.engine.query(dense.vertices_scan_mm)
-        observed = self._observed(dense, nearest, target, task.settings.normal_cosine)
-        covered, distance = self._quality(dense.vertices_scan_mm, nearest.distance[observed], target)
+        observed = self._find_observed(dense, nearest, target, task.settings.normal_cosine)
+        covered, distance = self._measure_quality(dense.vertices_scan_mm, nearest.distance[observed], target)
         T_template_scan = elastic.T_scan_template.inverse()
         mean, p95, p99, largest = (T_template_scan.scale * length for length in distance)
         vertices = T_template_scan.apply(dense.vertices_scan_mm)
@@ -488,10 +491,12 @@ class RoundContext:
             colours=None if target.mesh.colours is None else target.mesh.colours[nearest.vertex],
         )
 
-    def _observed(self, dense: DenseSurface, nearest: ClosestPoints, target: ScanTarget, cosine: float) -> BoolArray:
-        """Return (V,) which vertices the scan shows (C9): near it, and observed by the dense stage or on no rim.
+    def _find_observed(
+        self, dense: DenseSurface, nearest: ClosestPoints, target: ScanTarget, cosine: float
+    ) -> BoolArray:
+        """Return (V,) whether the scan shows each vertex (C9): near it, and observed by the dense stage or on no rim.
 
-        On a clean scan that stage drops vertices that are a little off it; those that it keeps on a rim are beyond it.
+        On a clean scan that stage drops vertices that are slightly off it; those that it keeps on a rim are beyond it.
         """
         if target.mesh.faces is None:
             return dense.seen
@@ -501,11 +506,13 @@ class RoundContext:
         inside = (alike > cosine) & ~on_boundary(nearest, target.mesh, target.rim)
         return np.asarray(near & (dense.seen | inside))  # C9
 
-    def _quality(self, vertices: FloatArray, forward: FloatArray, target: ScanTarget) -> tuple[float, _Distances]:
+    def _measure_quality(
+        self, vertices: FloatArray, forward: FloatArray, target: ScanTarget
+    ) -> tuple[float, _Distances]:
         """Return the share of the scan that is covered (C10), and distances both ways over the overlap.
 
         Args:
-            vertices: (V, 3) of the surface.
+            vertices: (V, 3) vertices of the surface.
             forward: distances of the observed vertices from the scan.
             target: the scan.
         """
@@ -526,10 +533,10 @@ class RoundContext:
 
 
 def _facing_like(scan: Mesh, surface: Mesh) -> Mesh:
-    """Return `scan`, its winding reversed where its normals oppose those of `surface`, on which it lies.
+    """Return `scan`, its winding reversed if its normals oppose those of `surface`, on which it lies.
 
-    Only sheets as much bowl as cap are reversed: the normals of others show which side is outside, and so which of two
-    poses is right.
+    Only sheets that resemble a bowl as much as a cap are reversed: the normals of others show which side is outside,
+    and so which of two poses is right.
     """
     if scan.faces is None or not len(boundary_edges(scan.faces)):
         return scan
@@ -546,6 +553,6 @@ def _is_same_rotation(a: Similarity, b: Similarity) -> bool:
 
 
 def likely_starts(start: Start) -> list[Start]:
-    """Return the best start and those about as good."""
-    others = [one for one in start.alternatives if _AS_GOOD * one.score_mm <= start.score_mm]
+    """Return the best start and the alternatives with about as good scores."""
+    others = [alternative for alternative in start.alternatives if _AS_GOOD * alternative.score_mm <= start.score_mm]
     return [start, *others][:_ALTERNATIVES]

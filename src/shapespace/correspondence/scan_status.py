@@ -23,33 +23,33 @@ _CONSENSUS, _RELIEF = 2.32, 9.73
 """Logistic model of the log odds that a surface is wrong, trained on simulated kinds of objects with mirrored and
 foreign scans, molars, femora and faces, as in benchmarks/scan_status.py."""
 _AMBIGUOUS, _GAP = 4.0, 0.2
-"""Log odds that are added where another map along the surface agrees nearly as well, and by how much less it agrees: of
+"""Log odds that are added if another map along the surface agrees nearly as well, and its gap in agreement: of
 17 maps of simulated figures the gap was 0.23 or more in 6 right ones with another map, 0.05 to 0.18 in 3 wrong ones."""
 _DOUBTED = 0.14
 """Probability that a surface is wrong from which it is doubtful."""
 
 _CLEAR = 1.3
-"""Agreement of reliefs (a correlation of 0.86) from which nothing is lacking: 33 wrong surfaces of 18 collections had
+"""Agreement of reliefs (a correlation of 0.86) from which none is lacking: 33 wrong surfaces of 18 collections had
 at most 1.21. Without this limit 10 instead of 5 of 174 right ones were doubtful, as the usual one can be above 1.8."""
 _UNUSUAL = 4.0
 """Robust standard deviations above the median from which a value needs review."""
-_LEAST_SPREAD = 0.25  # share of the median that counts as usual variation, where all scans are alike
+_LEAST_SPREAD = 0.25  # share of the median that counts as usual variation if all scans are alike
 _TO_STDDEV = 1.4826  # MAD to standard deviation of a normal distribution: 1 / 0.6745
 MOST_FOLDED = 0.01
-"""Share of folded triangles above which a surface needs review whatever the others have. The median surface of
+"""Share of folded triangles above which a surface needs review whatever the share of the others. The median surface of
 eight femora and of eight molars has none, with 1000 and 3000 vertices."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScanEvidence:
-    """What the shapes of the other scans say of one surface.
+    """Comparison of one surface with the shapes of the other scans.
 
     Args:
         relief_agreement: correlation of its relief with the usual one, transformed to the real line (C35).
         usual_relief_agreement: median of the scans.
         consensus_deg: rotation between its pose and the one on which the comparisons with anchors agree (C32).
-        relief_gap: by how much its relief agrees better than that of another map along the surface of an object that
-            bends; infinite where there is none.
+        relief_gap: agreement of its relief minus that of another map along the surface of an object that bends;
+            infinite without another map.
     """
 
     relief_agreement: float
@@ -58,7 +58,7 @@ class ScanEvidence:
     relief_gap: float = np.inf
 
     def features(self) -> tuple[float, float]:
-        """Return what speaks against the surface, 0 where nothing does: consensus, and what its relief lacks."""
+        """Return the evidence against the surface, 0 if there is none: from the consensus, and from its relief."""
         lacking = max(self.usual_relief_agreement - self.relief_agreement, 0.0)
         return float(self.consensus_deg > SAME_POSE_DEG), lacking if self.relief_agreement < _CLEAR else 0.0
 
@@ -69,8 +69,8 @@ class Judgement:
 
     Args:
         status: converged or doubtful.
-        probability: that its surface is right, as far as the other scans show.
-        doubt: why it is doubtful; empty where it is not.
+        probability: probability that its surface is right, given the other scans.
+        doubt: why the surface is doubtful; empty if it is not.
     """
 
     status: ScanStatus
@@ -107,11 +107,11 @@ class SurfaceMeasures:
     """Measures of a surface in correspondence that decide whether it needs review; not-a-number if unknown.
 
     Args:
-        distance: 99 % of the distances between scan and surface, both ways, are below it; share of the size.
+        distance: distance, as a share of the size, that 99 % of the distances between scan and surface are below.
         folded: share of the triangles that are folded, and are not on the mean shape.
         missing: share of the vertices that the scan does not show.
         unreached: share of the scan that the surface does not cover.
-        area_change: factor by which 95 % of the triangles grow or shrink at most, the change of size divided out.
+        area_change: factor by which 95 % of the triangles grow or shrink at most, the change of size removed.
         not_settled: RMS movement of the vertices in the last round, share of the size.
     """
 
@@ -143,7 +143,7 @@ def find_review_reasons(surfaces: Sequence[SurfaceMeasures], settled: float) -> 
     """Return for each of the `surfaces` of a collection the reasons to review it, the most unusual first.
 
     A measure is unusual if it is more than four robust standard deviations above the median of all surfaces. Folded
-    triangles, distances and parts that are not reached also have limits of their own.
+    triangles, distances and unreached parts also have limits of their own.
 
     Args:
         surfaces: all surfaces of the collection.

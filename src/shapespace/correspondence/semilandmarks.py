@@ -1,7 +1,7 @@
 """Semilandmarks: evenly spaced points on curves between landmarks, and on patches of surface within closed curves.
 
 A curve is a chain of shortest paths on the mean shape, and a patch the smaller side of a closed chain. The
-correspondence carries both to a specimen, where they are bent to its landmarks and spaced evenly on its own surface.
+correspondence maps both to a specimen, where they are bent to its landmarks and spaced evenly on its own surface.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class SemilandmarkSet:
     """Semilandmarks on one curve or patch.
 
     Args:
-        name: of the curve or patch; its semilandmarks are NAME_1, NAME_2, ...
+        name: name of the curve or patch; its semilandmarks are NAME_1, NAME_2, ...
         kind: curve or patch.
         along: names of landmarks on a curve, in order; the first can be the last again. For a patch, names of
             landmarks and curves around it, which end where they begin.
@@ -57,18 +57,18 @@ class SemilandmarkSet:
 
 @dataclass(frozen=True, eq=False)
 class _Plan:
-    """A set on the mean shape.
+    """A set of semilandmarks on the mean shape.
 
     Args:
-        one: the set.
-        landmarks: K names around or along it.
+        point_set: names and number of the semilandmarks.
+        landmarks: names of the K landmarks around or along it.
         corners, weights: (M, 3) points in triangles: first those of the K landmarks, then the path of a curve, or the
             semilandmarks and samples of a patch.
         triangles: (M,) indices of the triangles.
         bend: (M, K) share of the offset of each landmark that moves a point.
     """
 
-    one: SemilandmarkSet
+    point_set: SemilandmarkSet
     landmarks: tuple[str, ...]
     corners: IntArray
     weights: FloatArray
@@ -85,8 +85,8 @@ class Semilandmarks:
     """Curves and patches on the mean shape of specimens in correspondence.
 
     Args:
-        specimens: with the landmarks.
-        plans: of each set.
+        specimens: specimens with the landmarks.
+        plans: plan of each set.
     """
 
     specimens: MarkedSpecimens
@@ -99,25 +99,27 @@ class Semilandmarks:
         Raises:
             InputError: an unknown landmark, too few points, a boundary that is not closed, or a name that is not new.
         """
-        for k, one in enumerate(sets):
+        for k, point_set in enumerate(sets):
             taken = {*specimens.names, *(name for other in sets[:k] for name in (other.name, *other.names))}
-            if clash := [name for name in (one.name, *one.names) if name in taken]:
-                raise InputError(f"{one.kind} {one.name}: {clash[0]!r} is the name of another point; rename the set.")
+            if clash := [name for name in (point_set.name, *point_set.names) if name in taken]:
+                raise InputError(
+                    f"{point_set.kind} {point_set.name}: {clash[0]!r} is the name of another point; rename the set."
+                )
         surface = _MeanSurface(specimens)
-        curves = {one.name: one.along for one in sets if one.kind == "curve"}
-        return Semilandmarks(specimens, tuple(surface.plan(one, curves) for one in sets))
+        curves = {point_set.name: point_set.along for point_set in sets if point_set.kind == "curve"}
+        return Semilandmarks(specimens, tuple(surface.plan(point_set, curves) for point_set in sets))
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of all semilandmarks."""
-        return tuple(name for plan in self.plans for name in plan.one.names)
+        return tuple(name for plan in self.plans for name in plan.point_set.names)
 
     def sliders(self) -> list[tuple[str, str, str]]:
         """Return (before, slider, after) of the semilandmarks of all curves, as geomorph's `curves`."""
         rows: list[tuple[str, str, str]] = []
         for plan in self.plans:
-            if plan.one.kind == "curve":
-                chain = (plan.landmarks[0], *plan.one.names, plan.landmarks[-1])
+            if plan.point_set.kind == "curve":
+                chain = (plan.landmarks[0], *plan.point_set.names, plan.landmarks[-1])
                 rows += zip(chain, chain[1:], chain[2:], strict=False)
         return rows
 
@@ -127,33 +129,33 @@ class Semilandmarks:
         """Place the semilandmarks on a specimen.
 
         Args:
-            specimen: its corresponding surface.
+            specimen: corresponding surface of the specimen.
             landmarks: name -> (3,), all landmarks of the sets.
-            radius_90: of those that have a region.
-            scan: in the same frame; None for positions on `specimen`.
+            radius_90: radius of the 90 % region of each landmark that has a region.
+            scan: scan in the same frame; None for positions on `specimen`.
 
         Returns:
-            The semilandmarks; their regions are interpolated between those of the landmarks, where all have one.
+            The semilandmarks; their regions are interpolated between those of the landmarks, if all have one.
         """
         engine, faces = build_engine(scan or specimen), faces_of(specimen)
         mask = np.ones(len(specimen.vertices)) if specimen.observed is None else specimen.observed.astype(np.float64)
-        # Corners are in another order on mirrored surfaces, triangles are not.
+        # Mirrored surfaces have another order of corners, but the same order of triangles.
         growth = face_areas(specimen) / np.maximum(face_areas(Mesh(self.specimens.mean, faces)), 1e-300)
         points: dict[str, FloatArray] = {}
         radius, observed = list[FloatArray](), list[FloatArray]()
         for plan in self.plans:
             x, own = plan.interpolate(specimen.vertices), np.stack([landmarks[name] for name in plan.landmarks])
-            count, k = plan.one.points, len(own)
+            count, k = plan.point_set.points, len(own)
             x = x + plan.bend @ (own - x[:k])
-            if plan.one.kind == "curve":
+            if plan.point_set.kind == "curve":
                 at = _evenly_spaced(x[k:], count, engine)
             else:
                 first, samples = x[k : k + count], x[k + count :]
-                at = _spread(samples, growth[plan.triangles[k + count :]], first, _SPECIMEN_STEPS)
+                at = _spread_points(samples, growth[plan.triangles[k + count :]], first, _SPECIMEN_STEPS)
             near = np.asarray(cKDTree(x).query(at)[1])
             radius.append((plan.bend @ [radius_90.get(name, np.nan) for name in plan.landmarks])[near])
             observed.append(plan.interpolate(mask)[near])
-            points |= zip(plan.one.names, at, strict=True)
+            points |= zip(plan.point_set.names, at, strict=True)
         return TransferredLandmarks.on(specimen, scan, points, np.concatenate(radius), np.concatenate(observed))
 
 
@@ -171,43 +173,45 @@ class _MeanSurface:
         self._edges = np.unique(np.sort(self.mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)), axis=0)  # type: ignore[index]
         self._edge = float(self._lengths(self._edges).mean())
 
-    def plan(self, one: SemilandmarkSet, curves: Mapping[str, Sequence[str]]) -> _Plan:
+    def plan(self, point_set: SemilandmarkSet, curves: Mapping[str, Sequence[str]]) -> _Plan:
         """Return a set on this surface.
 
         Raises:
-            InputError: it names no landmarks of this surface, or its boundary is not closed.
+            InputError: the set uses unknown landmarks of this surface, or its boundary is not closed.
         """
-        label = f"{one.kind} {one.name}"
-        chain = list(one.along) if one.kind == "curve" else _boundary(one, curves)
+        label = f"{point_set.kind} {point_set.name}"
+        chain = list(point_set.along) if point_set.kind == "curve" else _trace_boundary(point_set, curves)
         if unknown := [name for name in chain if name not in self._landmarks]:
             raise InputError(
                 f"{label}: no marked specimen has a landmark named {unknown[0]!r}; correct the name, or mark it."
             )
         if len(chain) < 2 or any(a == b for a, b in pairwise(chain)):
             raise InputError(f"{label} needs two or more landmarks, neighbours different; add landmarks to it.")
-        if one.kind == "patch" and chain[0] != chain[-1]:
+        if point_set.kind == "patch" and chain[0] != chain[-1]:
             raise InputError(
                 f"{label}: its boundary begins at {chain[0]!r} and ends at {chain[-1]!r}, so it is not closed; let it "
                 "end where it begins."
             )
-        if one.points < 1:
-            raise InputError(f"{label} has {one.points} points; give 1 or more.")
-        segments = [self._path(a, b, label) for a, b in pairwise(chain)]
+        if point_set.points < 1:
+            raise InputError(f"{label} has {point_set.points} points; give 1 or more.")
+        segments = [self._shortest_path(a, b, label) for a, b in pairwise(chain)]
         path = np.concatenate([*(segment[:-1] for segment in segments), segments[-1][-1:]])
-        path = spaced_points(path, max(len(path), _PER_GAP * (one.points + 1)))
-        if one.kind == "patch":
-            samples = self._samples(path, one)
-            spread = samples[:: max(1, len(samples) // one.points)][: one.points]
-            path = np.concatenate([_spread(samples, np.ones(len(samples)), spread, _MEAN_STEPS), samples])
+        path = spaced_points(path, max(len(path), _PER_GAP * (point_set.points + 1)))
+        if point_set.kind == "patch":
+            samples = self._samples(path, point_set)
+            spread = samples[:: max(1, len(samples) // point_set.points)][: point_set.points]
+            path = np.concatenate([_spread_points(samples, np.ones(len(samples)), spread, _MEAN_STEPS), samples])
         names = tuple(dict.fromkeys(chain))
-        marks = np.stack([self._landmarks[name] for name in names])
-        near = self._engine.query(np.concatenate([marks, path]))
+        positions = np.stack([self._landmarks[name] for name in names])
+        near = self._engine.query(np.concatenate([positions, path]))
         assert near.triangle is not None and near.barycentric is not None
-        closeness = 1.0 / (((near.points[:, None] - marks) ** 2).sum(axis=2) + (1e-6 * self._edge) ** 2)
+        closeness = 1.0 / (((near.points[:, None] - positions) ** 2).sum(axis=2) + (1e-6 * self._edge) ** 2)
         corners = faces_of(self.mesh)[near.triangle]
-        return _Plan(one, names, corners, near.barycentric, near.triangle, closeness / closeness.sum(1, keepdims=True))
+        return _Plan(
+            point_set, names, corners, near.barycentric, near.triangle, closeness / closeness.sum(1, keepdims=True)
+        )
 
-    def _path(self, a: str, b: str, label: str) -> FloatArray:
+    def _shortest_path(self, a: str, b: str, label: str) -> FloatArray:
         """Return (M, 3) the shortest path between two landmarks."""
         start, end = sorted((a, b))
         if (start, end) not in self._paths:
@@ -234,7 +238,7 @@ class _MeanSurface:
             self._paths[start, end] = np.concatenate([ends[:1], fine[1:-1], ends[1:]])
         return self._paths[start, end] if (start, end) == (a, b) else self._paths[start, end][::-1]
 
-    def _samples(self, loop: FloatArray, one: SemilandmarkSet) -> FloatArray:
+    def _samples(self, loop: FloatArray, point_set: SemilandmarkSet) -> FloatArray:
         """Return (M, 3) random points, evenly dense, on the smaller side of a closed path."""
         loop = loop[:-1]
         tree, engine = cKDTree(loop), self._engine.query(loop)
@@ -259,11 +263,11 @@ class _MeanSurface:
         candidates = np.flatnonzero(inside[faces].any(axis=1))
         if not len(candidates):
             raise InputError(
-                f"patch {one.name}: its boundary encloses no vertex of the corresponding surfaces; choose landmarks "
-                "farther apart, or run shapespace correspond with more --vertices."
+                f"patch {point_set.name}: its boundary encloses no vertex of the corresponding surfaces; choose "
+                "landmarks farther apart, or run shapespace correspond with more --vertices."
             )
         rng, share = np.random.default_rng(0), face_areas(self.mesh)[candidates]
-        chosen = candidates[rng.choice(len(candidates), 2 * _SAMPLES * one.points, p=share / share.sum())]
+        chosen = candidates[rng.choice(len(candidates), 2 * _SAMPLES * point_set.points, p=share / share.sum())]
         points = np.einsum("mc,mcd->md", rng.dirichlet(np.ones(3), len(chosen)), self.mesh.vertices[faces[chosen]])
         near_loop = np.flatnonzero(inside)[distance[inside].argsort()[: len(loop)]]
         is_left = left[near_loop].mean() > 0.5
@@ -279,25 +283,25 @@ class _MeanSurface:
         return cast(Any, graph).maximum(graph.T)
 
 
-def _boundary(one: SemilandmarkSet, curves: Mapping[str, Sequence[str]]) -> list[str]:
-    """Return the landmarks around a patch; curves are reversed where they would not connect otherwise.
+def _trace_boundary(point_set: SemilandmarkSet, curves: Mapping[str, Sequence[str]]) -> list[str]:
+    """Return the landmarks around a patch; a curve is reversed if it would not connect otherwise.
 
     Raises:
         InputError: a curve does not begin or end where the part before it ends.
     """
-    parts = [list(curves.get(name, (name,))) for name in one.along]
+    parts = [list(curves.get(name, (name,))) for name in point_set.along]
     chain = parts[0] if parts else []
     if len(parts) > 1 and len(chain) > 1 and chain[-1] not in (parts[1][0], parts[1][-1]):
         chain = chain[::-1]
-    for name, part in zip(one.along[1:], parts[1:], strict=True):
+    for name, part in zip(point_set.along[1:], parts[1:], strict=True):
         if len(part) == 1:
             chain = chain + part if chain[-1] != part[0] else chain
         elif chain[-1] in (part[0], part[-1]):
             chain = chain + (part if chain[-1] == part[0] else part[::-1])[1:]
         else:
             raise InputError(
-                f"patch {one.name}: curve {name} neither begins nor ends at {chain[-1]!r}, so the boundary is not "
-                "closed; list curves and landmarks in the order around the patch."
+                f"patch {point_set.name}: curve {name} neither begins nor ends at {chain[-1]!r}, so the boundary is "
+                "not closed; list curves and landmarks in the order around the patch."
             )
     return chain
 
@@ -314,7 +318,7 @@ def _evenly_spaced(path: FloatArray, count: int, engine: ClosestPointEngine) -> 
     return points[1:-1]
 
 
-def _spread(samples: FloatArray, weight: FloatArray, first: FloatArray, steps: int) -> FloatArray:
+def _spread_points(samples: FloatArray, weight: FloatArray, first: FloatArray, steps: int) -> FloatArray:
     """Return points evenly spread among samples, from `first` by Lloyd's method (k-means)."""
     points, weighted = first, np.column_stack([samples * weight[:, None], weight])
     for _ in range(steps):

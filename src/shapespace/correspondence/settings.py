@@ -12,9 +12,9 @@ PoseRange: TypeAlias = Literal["search", "near", "as-given"]
 SIZE = 100.0
 """The template's RMS size in its own frame: all lengths of the method are in hundredths of an object's size."""
 LARGEST_ROTATION_DEG: Mapping[PoseRange, float] = {"near": 60.0, "as-given": 30.0}
-"""Rotation by which the pose of a scan may differ from the frame of its file."""
+"""Largest rotation, degrees, of the pose of a scan from the frame of its file."""
 FEWEST = 2
-"""Scans in a correspondence, and scans that must observe a vertex for it to be estimated where it is missing."""
+"""Smallest number of scans in a correspondence, and of scans that observe a vertex for its estimation elsewhere."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +33,7 @@ class CorrespondConfig:
         fewest_covered: smallest share of a scan that the template must cover.
         outlier_threshold: scans whose distance from their prediction by the largest group of similar scans is beyond
             this many times the median of that group are excluded as other objects.
-        mirror: what is done with scans that are mirror images of the majority, such as left among right teeth: they are
+        mirror: treatment of scans that are mirror images of the majority, such as left among right teeth: they are
             reflected (auto), excluded (ask), or the files are trusted (never).
         pose: rotation of the scans: found by a search over all rotations (search), or that of the frames of the files,
             refined by at most 30 degrees (as-given) or 60 degrees (near). Position and size are always found. A scan

@@ -81,12 +81,12 @@ def symmetrise(mesh: Mesh) -> SymmetricMesh:
     """Return the mean of a surface and its mirror image, with vertices in left and right pairs and on the midline.
 
     The surface is registered to its mirror image at the plane of `find_mirror`, and each vertex moves half way to its
-    place there. The mean is cut at the plane of these pairs, and the side with the larger area is mirrored.
+    position there. The mean is cut at the plane of these pairs, and the side with the larger area is mirrored.
     Landmarks are averaged with their partners on the other side.
 
     Args:
-        mesh: with triangles and mirror symmetry, such as a face or a skull, in any pose and unit. A part that is
-            missing on one side is taken from the other one.
+        mesh: surface with triangles and mirror symmetry, such as a face or a skull, in any pose and unit. A part that
+            is missing on one side is taken from the other one.
 
     Raises:
         InputError: the surface has no mirror symmetry.
@@ -105,7 +105,7 @@ def symmetrise(mesh: Mesh) -> SymmetricMesh:
     larger = -1.0 if float(face_areas(mesh) @ side) < 0 else 1.0
     T = _plane_frame(mesh.vertices, larger * mirror.normal, larger * mirror.offset, SIZE / size)
     own = mesh.with_vertices(T.apply(mesh.vertices))
-    image, is_paired = _registered(own, mirror_image(own))
+    image, is_paired = _register_to_image(own, mirror_image(own))
     # The mirror image at the plane of these pairs follows from the one at the first plane.
     normal, offset = plane_of_pairs(own.vertices[is_paired], image[is_paired] * FLIP)
     towards = np.sign(normal[0])
@@ -131,14 +131,14 @@ def _check_symmetry(mirror: SurfaceMirror, name: str) -> None:
     """Check that a surface has mirror symmetry.
 
     Raises:
-        InputError: it has none.
+        InputError: it has no mirror symmetry.
     """
     share, other = mirror.off_share, min(mirror.others_share, default=np.inf)
     if share > SYMMETRIC_SHARE and (share > _LARGEST_SHARE or share > _OTHER_PLANES * other):
         raise InputError(
             f"{name} has no mirror symmetry: it differs from its mirror image by {100 * share:.1f} % of its size, and "
             f"{100 * SYMMETRIC_SHARE:.0f} % is the limit, or {100 * _LARGEST_SHARE:.0f} % if no other plane is nearly "
-            "as good; use it as it is, or give a more symmetric object."
+            "as good; use it unchanged, or give a more symmetric object."
         )
 
 
@@ -151,8 +151,8 @@ def _plane_frame(vertices: FloatArray, normal: FloatArray, offset: float, scale:
     return Similarity(scale, rotation, -scale * rotation @ (centre - (normal @ centre - offset) * normal))
 
 
-def _registered(mesh: Mesh, image: Mesh) -> tuple[FloatArray, BoolArray]:
-    """Return the place (V, 3) of each vertex on the mirror image, and whether (V,) the image is observed there."""
+def _register_to_image(mesh: Mesh, image: Mesh) -> tuple[FloatArray, BoolArray]:
+    """Return the position (V, 3) of each vertex on the mirror image, and whether (V,) the image is observed there."""
     target = ScanTarget(image)
     settings = ElasticSettings(harmonics=_HARMONICS)
     state = register(Template.of(mesh, settings.harmonics), target, Similarity.identity(), settings)
@@ -193,7 +193,7 @@ def _mirrored_half(vertices: FloatArray, faces: IntArray, name: str) -> tuple[Fl
     for end, other in ((a, b), (b, a)):
         snapped[end[np.abs(x[end]) < _SNAPPED * np.abs(x[end] - x[other])]] = True
     while True:
-        half, triangles, origin = _cut(np.where(snapped[:, None], vertices * [0.0, 1.0, 1.0], vertices), faces)
+        half, triangles, origin = _cut_at_plane(np.where(snapped[:, None], vertices * [0.0, 1.0, 1.0], vertices), faces)
         count, on_plane = len(half), half[:, 0] == 0.0
         middle = int(on_plane.sum())
         order = np.argsort(~on_plane, kind="stable")
@@ -202,7 +202,7 @@ def _mirrored_half(vertices: FloatArray, faces: IntArray, name: str) -> tuple[Fl
         both, origin = np.concatenate([triangles, mirrored]).astype(np.int32), origin[order]
         if is_sheet(both):
             break
-        # Where the surface is almost in the plane, vertices that were moved to it join parts that are separate.
+        # If the surface is almost in the plane, vertices that were moved to it join parts that are separate.
         ends = both[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
         _, first, often = np.unique(ends, axis=0, return_inverse=True, return_counts=True)
         wrong = ends[often[first] > 1].ravel()
@@ -214,7 +214,7 @@ def _mirrored_half(vertices: FloatArray, faces: IntArray, name: str) -> tuple[Fl
     return np.concatenate([half, half[middle:] * FLIP]), both, np.concatenate([origin, origin[middle:]])
 
 
-def _cut(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray, IntArray]:
+def _cut_at_plane(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray, IntArray]:
     """Return the part of a surface with x >= 0 and triangles not in the plane x = 0, cut at that plane.
 
     Returns:

@@ -1,4 +1,4 @@
-"""The first template: the scan that is nearest to all others, whole and evenly meshed.
+"""The first template: the scan that is nearest to all others, without holes and evenly meshed.
 
 Before other shapes are known, its shape model has the modes of a smooth Gaussian process on it (C2).
 """
@@ -30,7 +30,7 @@ from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 MODES = 60  # slowest harmonics, three coordinates each
 RANGE_SHARE = 0.4  # share of the size; range of the smooth deformations (C2)
 AMPLITUDE_SHARE = 0.1
-"""Of the Gaussian process, as shares of the shape's size: how far it reaches along the surface, how much it moves."""
+"""Range and amplitude of the Gaussian process, as shares of the shape's size."""
 
 
 def generic_model(mesh: Mesh, harmonics: Harmonics, shapes: FloatArray | None = None) -> ShapeModel:
@@ -40,9 +40,9 @@ def generic_model(mesh: Mesh, harmonics: Harmonics, shapes: FloatArray | None = 
     part that is a similarity transform is removed.
 
     Args:
-        mesh: the mean, mm.
-        harmonics: of it.
-        shapes: (N, V, 3) aligned shapes; their variation joins the modes, and the process keeps a quarter of its
+        mesh: mean of the model, mm.
+        harmonics: harmonics of `mesh`.
+        shapes: (N, V, 3) aligned shapes; their variation is added to the modes, and the process keeps a quarter of its
             variance.
     """
     size = rms_size(mesh.vertices)
@@ -66,22 +66,22 @@ _POSE_HARMONICS = 40  # harmonics on the coarse mesh of the pose model
 # scans that may become the template, and scans each one is tried on: 36 registrations at most
 _CANDIDATES, _OTHERS = 6, 6
 _FEWEST = 100
-"""Vertices: fewer do not tell an object's shape."""
+"""Number of vertices: fewer do not describe an object's shape."""
 _AS_WHOLE = 0.93
-"""Candidates that show less than this share of what the most whole one shows lack a part."""
+"""Share of the surface of the most complete candidate; a candidate that shows less lacks a part."""
 _INSIDE = 0.05
-"""Scans of which more than this share of the area cannot be seen from outside have inner surfaces, as CT scans do."""
+"""Share of a scan's area that cannot be seen from outside, above which the scan has inner surfaces, as CT scans do."""
 _SMALL_HOLE, _LONGEST_HOLE = 0.15, 0.05
 """Holes with a border shorter than this share of the longest border, or of a circle of that size, are closed;
-the longest border of all may be one that the object has, and must be shorter to be closed."""
+the longest border of all may belong to the object, and must be shorter to be closed."""
 
 
 @dataclass(frozen=True, eq=False)
 class PoseModel:
-    """A template with few vertices, as a shape model for the pose search; in mm, of the size it has.
+    """A template with few vertices, as a shape model for the pose search, in mm and in its own size.
 
     Args:
-        model: with generic modes, and those of aligned shapes if there are some.
+        model: shape model with generic modes, and those of aligned shapes if there are any.
     """
 
     model: ShapeModel
@@ -91,7 +91,7 @@ class PoseModel:
         """Return the pose model of `mesh`, with the modes of aligned `shapes` (N, V, 3) on the same vertices too.
 
         Raises:
-            MeshError: it is not a sheet.
+            MeshError: the mesh is not a sheet.
         """
         parts, own = remesh.parted(faces_of(mesh))
         wanted = round(len(parts) * min(1.0, _POSE_VERTICES / len(own)))
@@ -123,10 +123,10 @@ class PoseModel:
 
 @dataclass(frozen=True)
 class TemplateChoice:
-    """The scan that is the first template.
+    """Choice of the first template among the scans.
 
     Args:
-        index: of the scan.
+        index: index of the chosen scan.
         nearness: (N,) mean distance from a candidate to other scans after smooth adaptation, share of its size;
             not-a-number for scans that were no candidates.
     """
@@ -138,13 +138,13 @@ class TemplateChoice:
 def choose_template(scans: Sequence[Mesh], seed: int) -> TemplateChoice:
     """Return which of `scans` is nearest to the others, judged by a few candidates and a few others.
 
-    Candidates are some with few pieces and short borders, as those lack least. One that is more than twice as far from
-    the others as the median candidate is another object. If some scans have inner surfaces, all are compared by their
-    outer surfaces, and one without inner surfaces is preferred. One that lacks a part shows less of the surface than
-    the others do where it lies on them, and is chosen only if all lack as much.
+    Candidates are scans with few pieces and short borders, as they are the most complete. A candidate that is more than
+    twice as far from the others as the median candidate is another object. If some scans have inner surfaces, all are
+    compared by their outer surfaces, and one without inner surfaces is preferred. A candidate that lacks a part shows
+    less of the surface than the others do where it lies on them, and is chosen only if all lack as much.
 
     Raises:
-        MeshError: none of them can be a template.
+        MeshError: none of the scans can be a template.
     """
     rng = np.random.default_rng(seed)
     incompleteness = np.array([_incompleteness(scan) for scan in scans])
@@ -190,7 +190,7 @@ def _candidates(incompleteness: FloatArray, most: int, rng: np.random.Generator)
 
 
 def check_template(template: Mesh) -> Mesh:
-    """Return a template that the user gives, repaired.
+    """Return the repaired template that the user gave.
 
     Raises:
         MeshError: it has no triangles, cannot be repaired, or has too few vertices to follow a scan.
@@ -245,7 +245,7 @@ def _area(scan: Mesh) -> float:
 
 
 def _incompleteness(scan: Mesh) -> float:
-    """Return a number that grows with the border of `scan`; infinite for what can be no template."""
+    """Return a number that grows with the border of `scan`; infinite for a scan that cannot be a template."""
     if scan.faces is None or len(scan.vertices) < _FEWEST:
         return np.inf
     ends = scan.vertices[boundary_edges(scan.faces)]

@@ -3,8 +3,8 @@
 Matches determine a position along the surface only as far as a patch around it cannot slide on itself: a plane slides
 along two directions, a cylinder along and around its axis, a sphere around its centre. This is the slippage of Gelfand
 and Guibas (Shape segmentation using local slippage analysis, SGP 2004), a posterior variance for matches along the
-normals. It is scaled by how far the shape differs from the mean along the surface, since a match is as wrong as shapes
-differ. Equations Cn are those of docs/correspondence.md.
+normals. It is scaled by the deviation of the shape from the mean along the surface, since errors of matches grow with
+differences between shapes. Equations Cn are those of docs/correspondence.md.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from shapespace.types import BoolArray, FloatArray, Mesh
 _PATCH, _AROUND, _DEVIATION = 0.1, 0.3, 0.6
 """Ranges of a patch, of its surroundings, and of the average of the deviation from the mean, shares of the size."""
 _SOURCES, _NEAREST = 5000, 128
-"""Vertices, at most, that averages over patches are taken of, and the nearest of them that a patch has: three standard
-deviations around a vertex, at a cost that grows only linearly with the vertices."""
+"""Largest number of vertices over which patches are averaged, and number of the nearest of these in a patch: three
+standard deviations around a vertex, at a cost that grows only linearly with the vertices."""
 _ROTATION, _SHARE_AROUND, _LEAST = 0.3, 0.1, 1e-3
 """Prior precision of the rotation of a patch, weight of the information of its surroundings, and the least information
 on a position, in units of the information of a patch whose normals are all parallel along their direction."""
@@ -34,14 +34,14 @@ positions are in the 90 % regions of faces, damaged faces, femora, cut femora, m
 
 @dataclass(frozen=True, eq=False)
 class VertexConfidence:
-    """How well matches determine positions along the surfaces of one correspondence.
+    """Certainty of positions along the surfaces of one correspondence, from the matches.
 
     Args:
         template: the mean shape.
-        harmonics: of the template.
-        patch: (V, V) sparse, weights of the average over the patch around each vertex: a Gaussian in space, of vertices
-            whose normals are less than 90 degrees apart. Unlike those of heat, cut off at some harmonics, no weight is
-            negative, and vertices far away, which have long arms, have none.
+        harmonics: harmonics of the template.
+        patch: (V, V) sparse, weights of the average over the patch around each vertex: a Gaussian in space, over
+            vertices whose normals are less than 90 degrees apart. Unlike the weights of heat, cut off at some
+            harmonics, none is negative, and vertices far away, which have long arms, have none.
     """
 
     template: Mesh
@@ -50,7 +50,7 @@ class VertexConfidence:
 
     @staticmethod
     def of(template: Mesh, harmonics: Harmonics) -> VertexConfidence:
-        """Return that of surfaces with the vertices of `template`."""
+        """Return the confidence for surfaces with the vertices of `template`."""
         length, normals = _PATCH * rms_size(template.vertices), vertex_normals(template)
         count = len(normals)
         drawn = np.random.default_rng(0).permutation(count)[:_SOURCES]
@@ -67,8 +67,8 @@ class VertexConfidence:
         """Return (V,) the standard deviation of the position of each vertex in any direction along the surface.
 
         Args:
-            vertices: (V, 3) of the surface, aligned to the template.
-            observed: (V,) whether the scan shows them.
+            vertices: (V, 3) vertices of the surface, aligned to the template.
+            observed: (V,) whether the scan shows the vertices.
             scans: number of shapes that the template is the mean of.
         """
         template, harmonics = self.template, self.harmonics

@@ -1,4 +1,4 @@
-"""The whole fit of a scan: place, drive, measure, judge."""
+"""The complete fit of a scan: initialise the pose, run the method, measure the distances, assess the fit."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from threadpoolctl import ThreadpoolController
 from shapespace.errors import FitError, InputError
 from shapespace.fit.diagnostics.verdict import judge
 from shapespace.fit.iteration_state import UNSEEN, Fitted, IcpState
-from shapespace.fit.method import Ended, Limits, Method
+from shapespace.fit.method import FitOutcome, Limits, Method
 from shapespace.fit.method_choices import method_named
 from shapespace.fit.result import FitResult, Stage
 from shapespace.fit.robust.prepared_model import SHARE, LandmarkConstraint
@@ -47,11 +47,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class RegionFit:
-    """What turns a fit of a part into one of the whole.
+    """Conversion of a fit of a part of a model into a fit of the complete model.
 
     Args:
-        full: the model.
-        part: of it.
+        full: the complete model.
+        part: the part of the model that is fitted.
     """
 
     full: ShapeModel
@@ -67,20 +67,20 @@ class RegionFit:
         return RegionFit(full, Part.of(full, region))
 
     def note(self, region: str | tuple[int, ...] | None) -> str:
-        """Return a sentence on what the fit is held to."""
+        """Return a sentence on the region that the fit is restricted to."""
         called = f" {region!r}" if isinstance(region, str) else ""
         inside = self.part.inside
         return (
-            f"Held to the region{called} of {int(inside.sum()):,} of the model's {len(inside):,} vertices; the rest of "
-            "the surface is what the model makes of it."
+            f"Restricted to the region{called} of {int(inside.sum()):,} of the model's {len(inside):,} vertices; the "
+            "rest of the surface is estimated by the model."
         )
 
     def state(self, state: IcpState) -> IcpState:
-        """Return a state with the coefficients of the whole."""
+        """Return a state with the coefficients of the complete model."""
         return replace(state, b=self.part.to_b(state.b, self.full))
 
-    def telling(self, on_state: Callable[[IcpState], None]) -> Callable[[IcpState], None]:
-        """Return what tells `on_state` of such states."""
+    def forward_states(self, on_state: Callable[[IcpState], None]) -> Callable[[IcpState], None]:
+        """Return a function that calls `on_state` with the states of the complete model."""
         return lambda state: on_state(self.state(state))
 
     def landmarks(self, model: ShapeModel) -> SurfaceLandmarks:
@@ -88,7 +88,7 @@ class RegionFit:
         return model.landmarks.within(self.part.inside)
 
     def fitted(self, fitted: Fitted, modes: int | None) -> Fitted:
-        """Return where the fit ended with the first `modes` coefficients of the whole, None for all."""
+        """Return the end of the fit with the first `modes` coefficients of the complete model, None for all."""
         from shapespace.fit.robust.posterior import variance_of_new_shapes  # compiled, and loads SciPy
 
         full, part, k = self.full, self.part, modes
@@ -119,13 +119,13 @@ class RegionFit:
 
 
 _FAR_OUT = 3.0  # standard deviations; a normal coefficient exceeds them once in 370
-_FAR_OUT_BY_CHANCE = 0.01  # share of coefficients beyond it that raises no note; chance alone gives 0.3 %
-_ALL_BUT_THE_RIM = 0.95  # share of vertices; a complete scan still leaves out vertices at its border
+_FAR_OUT_BY_CHANCE = 0.01  # share of coefficients beyond it up to which there is no note; chance alone gives 0.3 %
+_ALL_BUT_THE_RIM = 0.95  # share of vertices; a complete scan still lacks vertices at its border
 _VANISHED = 0.05
-"""Share of the start's scale below which nothing is left to fit."""
+"""Share of the start's scale below which the model counts as shrunk to a point."""
 
 OPTIONS = ("landmark_stddev_mm", "crop", "region", "strict")
-"""Settings that a record tells only where they are given."""
+"""Settings that a record contains only if they are set."""
 
 OnState: TypeAlias = Callable[[IcpState], None]
 PathTo: TypeAlias = str | os.PathLike[str]
@@ -139,8 +139,8 @@ class FitConfig:
         method: method that fits the placed model: a name of `METHODS` for its default settings, or an object such as
             `Robust(...)` or `Paper(...)`. `robust`: pose and shape jointly, from distances in both directions; `paper`:
             the paper's modified ICP.
-        modes: how many coefficients to report, from the first; None for all. The robust method fits with all in any
-            case; the paper's fits with these alone.
+        modes: number of coefficients to report, from the first; None for all. The robust method fits all modes in any
+            case; the paper's method fits only these.
         unit: unit of the scan; `auto` detects it from its size.
         scale: `free` estimates the scale, `fixed` keeps it; `auto`: free if the model's gauge is shape, fixed if it is
             form.
@@ -150,12 +150,12 @@ class FitConfig:
             RMS distance from its centre); `inf`: they only initialise the fit. The paper's method uses landmarks for
             the initialisation alone.
         dense: also deform the fitted surface further onto the scan, as the stage `dense` (robust method only).
-        dense_settings: settings of that.
+        dense_settings: settings of the dense stage.
         crop: fit only the part of the scan inside `sphere:X,Y,Z,RADIUS` or `box:X,Y,Z,X,Y,Z` (in its frame and unit),
-            or `landmarks:MM`, within this distance in mm of the landmarks; empty for the whole scan.
-        region: the part of the model that fit, distances and verdict are held to: a name of `ShapeModel.regions`, or
-            vertices; None for all of it.
-        strict: refuse scans with coordinates that are NaN or infinite (default: remove the triangles that use them,
+            or `landmarks:MM`, within this distance in mm of the landmarks; empty for the complete scan.
+        region: part of the model to which fit, distances and verdict are restricted: a name of `ShapeModel.regions`, or
+            indices of vertices; None for the complete model.
+        strict: reject scans with coordinates that are NaN or infinite (default: remove the triangles that use them,
             with a note).
 
     Raises:
@@ -184,9 +184,7 @@ class FitConfig:
                 raise InputError(f"There is no {name} {value!r}; choose one of {', '.join(choices)}.")
         fitting = self.fitting
         if self.dense and not fitting.goes_on_densely:
-            raise InputError(
-                f"The dense stage needs the robust method; leave out dense, or the method {fitting.name!r}."
-            )
+            raise InputError(f"The dense stage needs the robust method; omit dense, or the method {fitting.name!r}.")
         if self.landmark_stddev_mm is not None and not self.landmark_stddev_mm > 0:
             raise InputError(f"Landmarks need a positive standard deviation in mm, not {self.landmark_stddev_mm}.")
         if self.crop:
@@ -194,7 +192,7 @@ class FitConfig:
         if self.region is not None and not isinstance(self.region, str):
             object.__setattr__(self, "region", tuple(sorted({int(vertex) for vertex in self.region})))
         if self.dense and self.region is not None:
-            raise InputError("The dense stage follows all of a scan; leave out dense, or the region.")
+            raise InputError("The dense stage follows the complete scan; omit dense, or the region.")
         if self.modes is not None and self.modes < 1:
             raise InputError(f"A fit must report at least one mode, not {self.modes}.")
         if self.max_iterations < 1:
@@ -202,20 +200,20 @@ class FitConfig:
 
     @property
     def fitting(self) -> Method:
-        """The method itself, where it was given by name too."""
+        """The method as an object, even if it was given by name."""
         return method_named(self.method) if isinstance(self.method, str) else self.method
 
     def limits(self, model: ShapeModel) -> Limits:
-        """Return the settings of the method; a scale that goes by the gauge is free where size was divided out."""
+        """Return the limits of the method; `auto` frees the scale if the size was removed from the model."""
         with_scale = model.gauge == "shape" if self.scale == "auto" else self.scale == "free"
         return Limits(with_scale, self.modes, self.max_iterations)
 
     def as_dict(self) -> dict[str, Any]:
         """Return all settings as plain data for a record, those of the method under its name."""
-        # Not `asdict` of the whole: a method given by name has settings too.
+        # Not `asdict` of all fields: a method given by name has settings too.
         common = {name: getattr(self, name) for name in ("modes", "unit", "scale", "max_iterations", "seed", "dense")}
         method = self.fitting
-        # Options that are not set are not written, so that such records equal those of versions without them.
+        # Options that are not set are not written, so that such records equal those of versions without the options.
         if self.landmark_stddev_mm is not None:
             # JSON has no infinity.
             common["landmark_stddev_mm"] = self.landmark_stddev_mm if np.isfinite(self.landmark_stddev_mm) else "inf"
@@ -240,21 +238,21 @@ def fit_scan(
     T_scan_model: Similarity | None = None,
     on_state: OnState | None = None,
 ) -> FitResult:
-    """Fit `model` to a raw scan of any topology, pose and unit, and return its coefficients and how far to trust them.
+    """Fit `model` to a raw scan of any topology, pose and unit, and return coefficients, distances and a status.
 
     Args:
-        model: the shape space, or the path of its file.
-        scan: a mesh or point cloud, in its own frame and unit; its path; or whatever else `as_mesh` takes.
+        model: the shape model, or the path of its file.
+        scan: a mesh or point cloud, in its own frame and unit; its path; or any other input of `as_mesh`.
         config: settings; None for the defaults.
-        landmarks: name -> (3,) in the scan's frame and unit, or the path of their file, to start from and, by the
-            robust method, to be held to (`FitConfig.landmark_stddev_mm`); None to use none.
-        T_scan_model: a start, from the model's frame (mm) to the scan's frame and unit; None to find one.
+        landmarks: name -> (3,) in the scan's frame and unit, or the path of their file; they initialise the fit and, in
+            the robust method, constrain it (`FitConfig.landmark_stddev_mm`); None to use none.
+        T_scan_model: initial pose, from the model's frame (mm) to the scan's frame and unit; None to search for it.
         on_state: called with each state of the loop, for progress bars and viewers.
 
     Raises:
         MeshError: the scan cannot be used at all.
-        FitError: no start can be found, or the fit diverged.
-        InputError: the search needs triangles that the scan lacks; or `model` or `scan` is something else.
+        FitError: no initial pose can be found, or the fit diverged.
+        InputError: the search needs triangles that the scan lacks; or `model` or `scan` has an unsupported type.
         FileError: a file cannot be read.
     """
     config = config or FitConfig()
@@ -266,18 +264,18 @@ def fit_scan(
     if "landmarks" in files:
         landmarks = read_landmarks(files["landmarks"])
     landmarks = cast("Mapping[str, FloatArray] | None", landmarks)
-    # Products this small go slower by several threads, and many fits at a time share the cores anyway.
+    # Such small products are slower with several threads, and parallel fits share the cores anyway.
     with _thread_controller().limit(limits=1, user_api="blas"):
         clock = [time.perf_counter()]
         held = None if config.region is None else RegionFit.of(model, config.region)
         own = model if held is None else held.part.model
-        placed = _place(model, own, scan, config, landmarks, T_scan_model)
+        placed = _place_scan(model, own, scan, config, landmarks, T_scan_model)
         clock.append(time.perf_counter())
         limits = config.limits(model)
         if held is not None:
             limits, on_state = (
                 replace(limits, modes=None, part=True),
-                None if on_state is None else held.telling(on_state),
+                None if on_state is None else held.forward_states(on_state),
             )
         recorder = _Recorder(placed, on_state)
         states = config.fitting.states(own, placed.target, placed.start, limits)
@@ -290,10 +288,10 @@ def fit_scan(
             advice = "give landmarks (--landmarks), or crop the scan (--crop)"
             raise FitError(f"{placed.scan.name}: the fit diverged ({error}); {advice}.") from error
         clock.append(time.perf_counter())
-        stages = _measure(own, placed, driven, config)
+        stages = _measure_stages(own, placed, driven, config)
         clock.append(time.perf_counter())
         size_mm = rms_size(own.mean_vertices) * driven.fitted.T_scan_fitted.scale
-        ended = Ended(own, placed.start, driven.fitted, stages, driven.ended, size_mm)
+        ended = FitOutcome(own, placed.start, driven.fitted, stages, driven.ended, size_mm)
         status, reasons = judge(config.fitting, ended)
         if held is not None:
             driven = replace(
@@ -302,7 +300,7 @@ def fit_scan(
                 ended={phase: held.state(state) for phase, state in driven.ended.items()},
                 fitted=held.fitted(driven.fitted, config.modes),
             )
-            stages = _measure(model, placed, driven, config, held.part.inside)
+            stages = _measure_stages(model, placed, driven, config, held.part.inside)
         clock.append(time.perf_counter())
     fitted = driven.fitted
     return FitResult(
@@ -330,9 +328,9 @@ def fit_scan(
         notes=[
             *placed.findings,
             *([] if held is None else [held.note(config.region)]),
-            *_far_out(model, fitted.b),
-            *_no_triangles(placed.scan),
-            *_not_all_seen(stages),
+            *_note_large_coefficients(model, fitted.b),
+            *_note_no_triangles(placed.scan),
+            *_note_unobserved(stages),
             *fitted.notes,
         ],
         seconds={
@@ -353,7 +351,7 @@ def fit_scan(
 
 @cache
 def _thread_controller() -> ThreadpoolController:
-    """Return the controller of the BLAS libraries; finding them takes 2 ms, so it is done once in a process."""
+    """Return the controller of the BLAS libraries; finding them takes 2 ms, so it is done once per process."""
     import scipy.linalg  # pyright: ignore[reportUnusedImport]  # noqa: F401  # its library must be loaded to be found
 
     return ThreadpoolController()
@@ -364,15 +362,15 @@ def _as_model(model: ShapeModel | AdditiveModel | PathTo) -> ShapeModel:
         return ShapeModel.load(Path(model))
     if isinstance(model, ShapeModel):
         return model
-    shape = getattr(model, "shape", None)  # of an additive model
+    shape = getattr(model, "shape", None)  # an additive model has one
     if not isinstance(shape, ShapeModel):
-        raise InputError(f"A scan is fitted by a ShapeModel or by the file of one, not by {type(model).__name__}.")
+        raise InputError(f"A scan is fitted by a ShapeModel or by its file, not by {type(model).__name__}.")
     return shape
 
 
 @dataclass(frozen=True, eq=False)
-class _Placed:
-    """A scan in its mm frame, and where the model begins there."""
+class _PlacedScan:
+    """A scan in its mm frame, and the initial pose of the model there."""
 
     scan: Mesh
     mm_per_scan_unit: float
@@ -383,8 +381,8 @@ class _Placed:
 
 
 @dataclass(frozen=True, eq=False)
-class _Driven:
-    """What a method went through: every state, the last of each phase, the end."""
+class _MethodRun:
+    """The run of a method: every state, the last state of each phase, the end."""
 
     history: Sequence[IcpState]
     ended: Mapping[int, IcpState]
@@ -395,7 +393,7 @@ class _Driven:
 class _Recorder:
     """Collects the states of a method."""
 
-    def __init__(self, placed: _Placed, on_state: OnState | None) -> None:
+    def __init__(self, placed: _PlacedScan, on_state: OnState | None) -> None:
         self._placed, self._on_state = placed, on_state
         self._history: list[IcpState] = []
         self._ended: dict[int, IcpState] = {}
@@ -416,23 +414,23 @@ class _Recorder:
         if state.T_scan_model.scale < _VANISHED * self._placed.start.T_scan_model.scale:
             raise FitError(
                 f"{self._placed.scan.name}: the model shrank to a point, as the plain method does when a large part of "
-                "the scan is missing; hold the scale (--scale fixed), or fit only the part that it shows (--region)."
+                "the scan is missing; fix the scale (--scale fixed), or fit only the part that it shows (--region)."
             )
 
-    def driven(self, fitted: Fitted) -> _Driven:
+    def driven(self, fitted: Fitted) -> _MethodRun:
         """Return the states together with the end of the fit."""
-        return _Driven(self._history, self._ended, self._phase_2_from, fitted)
+        return _MethodRun(self._history, self._ended, self._phase_2_from, fitted)
 
 
-def _place(
+def _place_scan(
     full_model: ShapeModel,
     model: ShapeModel,
     scan: Mesh,
     config: FitConfig,
     landmarks: Mapping[str, FloatArray] | None,
     T_scan_model: Similarity | None,
-) -> _Placed:
-    """Crop and repair the scan, find its unit, and find where to begin; landmarks are those of the `whole` model."""
+) -> _PlacedScan:
+    """Crop and repair the scan, find its unit and the initial pose; landmarks are those of the complete model."""
     landmarks, turned = landmarks_in_frame_of(scan, landmarks or {})
     notes = list(turned)
     if config.crop:
@@ -456,13 +454,13 @@ def _place(
         stddev_mm = config.landmark_stddev_mm or SHARE * rms_size(full_model.mean_vertices) * start.T_scan_model.scale
         start = replace(start, marks=LandmarkConstraint.of(model, marks_mm, stddev_mm))
     notes += [*scan.notes, *(f"{finding.problem} {finding.action}".strip() for finding in findings)]
-    return _Placed(scan, mm, T_mm_scan.inverse(), ScanTarget(scan_mm), start, notes)
+    return _PlacedScan(scan, mm, T_mm_scan.inverse(), ScanTarget(scan_mm), start, notes)
 
 
-def _measure(
-    model: ShapeModel, placed: _Placed, driven: _Driven, config: FitConfig, region: BoolArray | None = None
+def _measure_stages(
+    model: ShapeModel, placed: _PlacedScan, driven: _MethodRun, config: FitConfig, region: BoolArray | None = None
 ) -> dict[str, Stage]:
-    """Return the surface at each stage, with its distances, held to `region` (V,), when they are asked for."""
+    """Return the surface at each stage, with its distances, restricted to `region` (V,) and measured on demand."""
     target, fitted, T_scan_mm = placed.target, driven.fitted, placed.T_scan_mm
     together = target.mesh.vertices.mean(axis=0) - model.mean_vertices.mean(axis=0)
     moments = {
@@ -471,7 +469,7 @@ def _measure(
         "final": (fitted.T_scan_model, fitted.b),
     }
     stages = {
-        name: Stage(T_scan_mm @ T, b, partial(_distances, model, target, T, b, None, region))
+        name: Stage(T_scan_mm @ T, b, partial(_measure_distances, model, target, T, b, None, region))
         for name, (T, b) in moments.items()
     }
     if config.dense:
@@ -482,13 +480,13 @@ def _measure(
 def _landmark_stddev_mm(
     model: ShapeModel, fitted: Fitted, held: RegionFit | None, *, dense: bool
 ) -> dict[str, FloatArray] | None:
-    """Return name -> (3,) of where each of the model's landmarks lies, mm of the scan."""
+    """Return name -> (3,) standard deviation of the position of each landmark of the model, mm of the scan."""
     if fitted.landmark_covariance is None:
         return None
     variance = np.einsum("lii->li", fitted.landmark_covariance).copy()
     landmarks = model.landmarks if held is None else held.landmarks(model)
     if not dense:
-        # The surface was projected onto the model's modes; the motion of a landmark by it is an error of the landmark.
+        # The surface was projected onto the model's modes, and the projection moves a landmark away from its position.
         modes = landmarks.interpolate(model.vertex_basis.reshape(model.n_vertices, 3, -1))[:, :, : len(fitted.b)]
         in_modes = fitted.T_scan_model.apply(landmarks.interpolate(model.mean_vertices) + modes @ fitted.b)
         variance += (in_modes - landmarks.interpolate(fitted.vertices_scan_mm)) ** 2
@@ -496,7 +494,7 @@ def _landmark_stddev_mm(
 
 
 def _region_settings(vertices: tuple[int, ...]) -> dict[str, Any]:
-    """Return the entry of a record for a region that no model has by name."""
+    """Return the entry of a record for a region that has no name in the model."""
     numbers = np.array(vertices, dtype="<i8").tobytes()
     return {"vertices": len(vertices), "hash": hashlib.sha256(numbers).hexdigest()}
 
@@ -508,30 +506,30 @@ def _in_standard_deviations(b_covariance: FloatArray | None, model: ShapeModel) 
     return b_covariance / (stddev[:, None] * stddev)
 
 
-def _not_all_seen(stages: Mapping[str, Stage]) -> list[str]:
+def _note_unobserved(stages: Mapping[str, Stage]) -> list[str]:
     dense = stages.get("dense")
     if dense is None or dense.seen is None or dense.seen.mean() > _ALL_BUT_THE_RIM:
         return []
     return [
-        f"The dense surface follows the scan at {100 * dense.seen.mean():.0f} % of its vertices; where the scan shows "
-        "nothing the model stands in."
+        f"The dense surface follows the scan at {100 * dense.seen.mean():.0f} % of its vertices; at the others the "
+        "scan shows nothing, and the surface follows the model."
     ]
 
 
-def _no_triangles(scan: Mesh) -> list[str]:
+def _note_no_triangles(scan: Mesh) -> list[str]:
     if scan.faces is not None:
         return []
-    return ["It has no triangles, so distances are to its points and larger than to the surface they stand for."]
+    return ["It has no triangles, so distances are to its points and larger than to the surface that they sample."]
 
 
-def _far_out(model: ShapeModel, b: FloatArray) -> list[str]:
-    """Say when more coefficients lie far out than chance would have it; without a prior faint modes chase details."""
+def _note_large_coefficients(model: ShapeModel, b: FloatArray) -> list[str]:
+    """Note that more coefficients are large than by chance; without a prior faint modes follow details of the scan."""
     far = int((np.abs(b) > _FAR_OUT * model.stddev[: len(b)]).sum())
     if far <= 1 + _FAR_OUT_BY_CHANCE * len(b):
         return []
     return [
         f"{far} of {len(b)} coefficients lie over {_FAR_OUT:g} standard deviations out; the faint modes follow "
-        "details of the scan that the model does not know, so build it with fewer modes (--modes) for plausible ones."
+        "details of the scan that the model does not contain; build it with fewer modes (--modes) for plausible ones."
     ]
 
 
@@ -545,7 +543,7 @@ def _dense_stage(
     return Stage(
         T_scan_mm @ T,
         fitted.b,
-        partial(_distances, model, target, T, fitted.b, dense.vertices_scan_mm),
+        partial(_measure_distances, model, target, T, fitted.b, dense.vertices_scan_mm),
         vertices=T_scan_mm.apply(dense.vertices_scan_mm),
         seen=dense.seen,
         moved_mm=dense.moved_mm * fitted.T_scan_fitted.scale,
@@ -556,13 +554,13 @@ def _closest(target: ScanTarget, T_mm_scan: Similarity, points: FloatArray) -> C
     return target.engine.query(T_mm_scan.apply(points))
 
 
-def _distances(
+def _measure_distances(
     model: ShapeModel, target: ScanTarget, T: Similarity, b: FloatArray, vertices_scan_mm: FloatArray | None = None,
     region: BoolArray | None = None,
 ) -> SurfaceDistances:  # fmt: skip
-    """Measure the shape with coefficients `b` at `T`, or the surface `vertices_scan_mm` (V, 3) that was made of it.
+    """Measure the shape with coefficients `b` at `T`, or the surface `vertices_scan_mm` (V, 3) derived from that shape.
 
-    Distances are in mm of the scan. Only the vertices of `region` (V,) count where there is one.
+    Distances are in mm of the scan. If `region` (V,) is given, only its vertices count.
     """
     vertices = T.apply(model.reconstruct(b)) if vertices_scan_mm is None else vertices_scan_mm
     placed = Mesh(vertices, model.faces, name="model")

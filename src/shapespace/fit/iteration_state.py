@@ -1,4 +1,4 @@
-"""What an iteration knows, when to stop, and which parts of the model the scan decides: shared by both phases."""
+"""State of an iteration, stopping rule, and the parts of the model that the scan determines: shared by both phases."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ class IcpState:
 
     Args:
         phase: 1 or 2.
-        iteration: from 0, the start, counted by phase.
+        iteration: number of the iteration in its phase; 0 is the start.
         T_scan_model: similarity from the model's frame to the scan's mm frame.
         b: (K,) coefficients, mm; zero throughout phase 1.
-        rms_mm: RMS distance of the model's vertices that the method looks at, in both methods whether they count or
-            not, from their closest scan points, mm of the scan.
+        rms_mm: RMS distance from the sampled vertices of the model (all of them in the paper's method), whether their
+            matches count or not, to their closest scan points, mm of the scan.
         motion_mm: largest movement of a model vertex in this iteration, mm of the scan.
-        stopped: None while running, else why: `rate`, or `cap`.
+        stopped: None while running, else the reason of the stop: `rate`, or `cap`.
     """
 
     phase: int
@@ -42,22 +42,22 @@ class IcpState:
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """Where a method ended, in the scan's mm frame.
+    """End of a method, in the scan's mm frame.
 
     Args:
-        T_scan_model: from the model's frame to the scan's mm frame.
+        T_scan_model: similarity from the model's frame to the scan's mm frame.
         b: (K,) coefficients, mm.
-        b_stddev: (K,) their standard deviation, mm.
+        b_stddev: (K,) standard deviations of the coefficients, mm.
         shrinkage: (K,) in [0, 1]: 1 where the scan determines the coefficient, 0 where only the prior does.
         T_scan_fitted: pose of the surface that was fitted, before its projection onto the model's modes.
-        vertices_scan_mm: (V, 3) that surface in the scan's mm frame; it may leave the span of the model,
-        outside_mm: by this (RMS), mm of the scan.
-        regions: finds the code of each vertex, (V,), in `fit.regions.REGIONS`.
-        evidence: diagnostics from which the status is computed; None of a method without any.
-        b_covariance: (K, K) of the coefficients, mm^2, where the method finds it.
+        vertices_scan_mm: (V, 3) fitted surface in the scan's mm frame; it may leave the span of the model.
+        outside_mm: RMS distance of the fitted surface from the span of the model, mm of the scan.
+        regions: function that finds the code of each vertex, (V,), in `fit.regions.REGIONS`.
+        evidence: diagnostics from which the status is computed; None of a method without diagnostics.
+        b_covariance: (K, K) covariance of the coefficients, mm^2; None if the method does not estimate it.
         notes: sentences on problems of the scan.
-        landmark_covariance: (L, 3, 3) of where the model's landmarks lie in that frame, mm^2, in the model's order,
-            where the method finds it.
+        landmark_covariance: (L, 3, 3) covariance of the positions of the model's landmarks in that frame, mm^2, in the
+            model's order; None if the method does not estimate it.
     """
 
     T_scan_model: Similarity
@@ -76,7 +76,7 @@ class Fitted:
 
 @dataclass(frozen=True, eq=False)
 class RobustFitted(Fitted):
-    """Where the robust method ended, with the diagnostics of its last iterate."""
+    """End of the robust method, with the diagnostics of its last iterate."""
 
     match_evidence: MatchEvidence = field(kw_only=True)
 
@@ -99,8 +99,8 @@ class StopRule:
 
     Args:
         rate: stop when |e_k - e_(k-1)| is at most this share of e_(k-1).
-        motion_mm: and no vertex moves more than this, mm of the model's frame; the RMS alone is blind to sliding
-            (erratum to step 4). Infinity gives the rule as printed.
+        motion_mm: largest movement of a vertex, mm of the model's frame, up to which the iteration may stop; the RMS
+            alone does not detect sliding (erratum to step 4). Infinity gives the rule as printed.
         max_iterations: cap of each phase.
 
     Raises:
@@ -116,7 +116,7 @@ class StopRule:
             raise InputError("A stopping rule needs a positive rate and motion and at least one iteration.")
 
     def why(self, rms_mm: Sequence[float], motion_mm: float) -> str | None:
-        """Return `rate` or `cap` when the history of `rms_mm` says stop, else None; both in mm of the model's frame."""
+        """Return `rate` or `cap` if the rule stops after `rms_mm`, else None; both in mm of the model's frame."""
         if len(rms_mm) >= 2:
             change = abs(rms_mm[-1] - rms_mm[-2])
             if change <= self.rate * max(rms_mm[-2], 1e-12) and motion_mm <= self.motion_mm:
@@ -130,16 +130,16 @@ def largest_motion(moved: FloatArray) -> float:
 
 
 REGIONS = ("followed", "rejected", "border", "unseen")
-"""Codes 0 to 3: the match counted; the scan shows something else there; it ends there; it shows nothing there."""
+"""Codes 0 to 3: the match counted; the scan shows another surface there; it ends there; it shows nothing there."""
 
 FOLLOWED, REJECTED, BORDER, UNSEEN = range(4)
 SHOWN = (FOLLOWED, REJECTED)
-"""Where the scan shows something, be it what the model follows or not."""
+"""Regions where the scan shows a surface, whether the model follows it or not."""
 
 MATCHED = (FOLLOWED, BORDER)
-"""Where the model follows the scan, up to its border."""
+"""Regions where the model follows the scan, up to its border."""
 
 
 def all_followed(vertices: int) -> IntArray:
-    """Return the codes (V,) of a method that takes every vertex for matched."""
+    """Return the codes (V,) of a method that counts every vertex as matched."""
     return np.full(vertices, FOLLOWED, dtype=np.int32)

@@ -1,4 +1,4 @@
-"""Protocol of a fitting method: an object that owns its settings, its loop, its doubts and its reason."""
+"""Protocol of a fitting method: an object with its settings, its loop, its doubts and its reason."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class Limits:
 
     Args:
         with_scale: whether the pose has a free scale.
-        modes: how many coefficients to report, from the first; None for all.
+        modes: number of coefficients to report, from the first; None for all.
         max_iterations: cap of each phase.
-        part: whether the model is a part of a larger one, which need not be symmetric where the whole is.
+        part: whether the model is a part of a larger model, which need not be symmetric even if the larger model is.
     """
 
     with_scale: bool
@@ -32,14 +32,14 @@ class Limits:
 
 
 @dataclass(frozen=True, eq=False)
-class Ended:
-    """A fit at its end, to be judged.
+class FitOutcome:
+    """The end of a fit, from which its status is computed.
 
     Args:
-        model: the shape space.
-        start: where it began, in the scan's mm frame.
-        fitted: where it ended, in that frame.
-        stages: the surface at each stage, with its distances when they are asked for.
+        model: the shape model.
+        start: initial pose, in the scan's mm frame.
+        fitted: end of the fit, in that frame.
+        stages: surface at each stage, with its distances, which are measured on demand.
         phases: the last state of each phase, by its number.
         size_mm: RMS distance of the model's mean from its centre, mm of the scan.
     """
@@ -56,27 +56,27 @@ class Method(Protocol):
     """A way to fit a placed model; a frozen dataclass whose fields are its settings."""
 
     name: ClassVar[str]
-    """By which it is chosen, and called in results."""
+    """Name by which the method is selected and reported."""
     calibrated: ClassVar[bool]
-    """Whether `b_stddev` was checked against truths (docs/uncertainty.md)."""
+    """Whether `b_stddev` was validated against known truths (docs/uncertainty.md)."""
     goes_on_densely: ClassVar[bool]
-    """Whether the surface it ends with can be taken the rest of the way to the scan."""
+    """Whether the dense stage can follow the method."""
 
     def states(
         self, model: ShapeModel, scan: ScanTarget, start: Start, limits: Limits
     ) -> Generator[IcpState, None, Fitted]:
-        """Yield the states it goes through, the last of each phase being where that phase ended; return the end.
+        """Yield the states of the fit; the last state of each phase is the end of the phase. Return the end of the fit.
 
         Raises:
-            InputError: model or scan lack what it needs.
+            InputError: model or scan lack data that the method needs.
             FitError: the fit diverged.
         """
         ...
 
-    def doubts(self, ended: Ended) -> list[Reason]:
-        """Return reasons not to trust the fit, the most serious first; empty where there are none."""
+    def doubts(self, ended: FitOutcome) -> list[Reason]:
+        """Return reasons not to trust the fit, the most serious first; empty without doubts."""
         ...
 
-    def reason(self, ended: Ended) -> Reason:
-        """Return why a fit without doubts ended where it did."""
+    def reason(self, ended: FitOutcome) -> Reason:
+        """Return why a fit without doubts stopped."""
         ...

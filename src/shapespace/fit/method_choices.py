@@ -12,7 +12,7 @@ from shapespace.fit.paper.paper_method import Paper
 from shapespace.fit.robust.robust_method import Robust
 
 METHODS: Mapping[str, Callable[..., Method]] = {"robust": Robust, "paper": Paper}
-"""Each is called with settings of its own, or with none for the defaults."""
+"""Name -> class of the method, which is called with its settings, or without for the defaults."""
 
 
 def method_named(name: str, **settings: Any) -> Method:
@@ -27,5 +27,5 @@ def method_named(name: str, **settings: Any) -> Method:
     known = {field.name for field in fields(method)}  # type: ignore[arg-type]
     for setting in settings:
         if setting not in known:
-            raise InputError(f"The method {name!r} has no setting {setting!r}; leave it out, or choose another method.")
+            raise InputError(f"The method {name!r} has no setting {setting!r}; omit it, or choose another method.")
     return METHODS[name](**settings)

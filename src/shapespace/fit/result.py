@@ -29,11 +29,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class OverlapDistances:
-    """Distances over the parts that scan and model both contain, mm of the scan: look at these first.
+    """Distances over the parts that scan and model both contain, mm of the scan.
 
     Args:
-        model_to_scan: over the model's vertices that the scan shows; the others are estimates.
-        scan_to_model: over the scan's vertices that the model covers.
+        model_to_scan: distances of the model's vertices that the scan shows; the other vertices are estimates.
+        scan_to_model: distances of the scan's vertices that the model covers.
         model_seen_share: share of the model's vertices that the scan shows.
         scan_covered_share: share of the scan's vertices that the model covers.
 
@@ -50,7 +50,7 @@ class OverlapDistances:
 
 Status: TypeAlias = Literal["converged", "max_iterations", "doubtful", "failed"]
 STAGES = ("before", "initial", "final")
-"""Stages of every fit: centroids aligned, after phase 1, after phase 2. `dense` follows where it was asked for."""
+"""Stages of every fit: centroids aligned, after phase 1, after phase 2. `dense` follows if it was requested."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,10 +58,10 @@ class Stage:
     """The fitted surface at one stage of the fit.
 
     Args:
-        T_scan_model: from the model's frame (mm) to the scan's frame and unit.
+        T_scan_model: similarity from the model's frame (mm) to the scan's frame and unit.
         b: (K,) coefficients, mm.
-        measure: measures the distances to the scan.
-        vertices: (V, 3) in the scan's frame and unit where the surface is not the model's with b; else None.
+        measure: function that measures the distances to the scan.
+        vertices: (V, 3) vertices in the scan's frame and unit if the surface is not the model's with b; else None.
         seen: (V,) False where the scan does not show such a surface; else None.
         moved_mm: RMS displacement of such a surface along its normals over seen vertices, mm of the scan.
 
@@ -81,7 +81,7 @@ class Stage:
 
     @cached_property
     def distances(self) -> SurfaceDistances:
-        """Distances to the scan and back, mm of the scan, measured when first asked for."""
+        """Distances to the scan and back, mm of the scan, measured on first access."""
         return self.measure()
 
 
@@ -92,21 +92,23 @@ class FitResult:
     Lengths are in mm of the scan, its real size; only the coefficients `b` and `b_stddev` are in mm of the model.
 
     Args:
-        scan_name: as the mesh was named.
+        scan_name: name of the scan.
         status: `converged`, `max_iterations`, or `doubtful` when the fit should not be trusted.
-        reasons: why it has that status, as codes with data.
-        T_scan_model: from the model's frame (mm) to the scan's frame and unit.
-        mm_per_scan_unit: the scan's unit as found or given.
+        reasons: reasons for the status, as codes with data.
+        T_scan_model: similarity from the model's frame (mm) to the scan's frame and unit.
+        mm_per_scan_unit: unit of the scan, detected or given, in mm.
         b: (K,) coefficients, mm of the model's frame.
-        b_stddev: (K,) their standard deviation, mm of the model's frame. Of the robust method it is calibrated
-            (docs/uncertainty.md); of the paper's it depends on the model's own noise and is mostly too small.
+        b_stddev: (K,) standard deviations of the coefficients, mm of the model's frame. They are calibrated for the
+            robust method (docs/uncertainty.md); for the paper's method they depend on the model's own noise and are
+            mostly too small.
         shrinkage: (K,) in [0, 1]: near 1 where the scan determines the coefficient, near 0 where only the prior does.
-        z: (K,) b in standard deviations of the model.
-        z_covariance: (K, K) of z, calibrated; None of the paper's method. It is in no file.
-        stages: the surface at each of `STAGES`, and at `dense` where that was asked for.
-        history: every state the loop went through, in the scan's mm frame.
-        method: name of the method that ran.
-        calibrated: whether `b_stddev` was checked against truths (docs/uncertainty.md); not of the paper's method.
+        z: (K,) coefficients b in standard deviations of the model.
+        z_covariance: (K, K) calibrated covariance of z; None for the paper's method. No file contains it.
+        stages: surface at each of `STAGES`, and at `dense` if it was requested.
+        history: every state of the loop, in the scan's mm frame.
+        method: name of the method.
+        calibrated: whether `b_stddev` was validated against known truths (docs/uncertainty.md); False for the paper's
+            method.
         config: every setting in effect, with the software version.
         start: source of the start: `landmarks`, `upright`, `rotations` or `given`.
         evidence: diagnostics from which the status is computed; None for the paper's method, which uses distances.
@@ -114,12 +116,12 @@ class FitResult:
         seconds: duration of each part.
         model: the model that was fitted.
         scan: the repaired scan, in its own frame and unit.
-        find_regions: finds `regions`.
-        find_closest: finds the closest points of the scan to vertices (V, 3) in its own frame and unit.
-        landmark_stddev_mm: name -> (3,) standard deviation of where each of `landmarks` lies, along the axes of the
-            scan's frame, mm of the scan (docs/landmarks.md); None of the paper's method, and without those outside
-            the region that the fit was held to.
-        files: of `model`, `scan` and `landmarks`, as far as they were read from files.
+        find_regions: function that finds `regions`.
+        find_closest: function that finds the closest points of the scan to vertices (V, 3) in its own frame and unit.
+        landmark_stddev_mm: name -> (3,) standard deviation of the position of each of `landmarks`, along the axes of
+            the scan's frame, mm of the scan (docs/landmarks.md); without landmarks outside the region of a region fit;
+            None for the paper's method.
+        files: paths of `model`, `scan` and `landmarks`, as far as they were read from files.
 
     Example:
         >>> fit = ss.fit_scan(model, meshes[1])
@@ -163,29 +165,29 @@ class FitResult:
 
     @property
     def reason(self) -> str:
-        """One sentence on why it has its status, made of `reasons`."""
+        """One sentence that explains the status, made from `reasons`."""
         return sentence_of(self.status, self.reasons)
 
     @cached_property
     def regions(self) -> IntArray:
-        """(V,) code of each model vertex in `fit.regions.REGIONS`, found when first asked for.
+        """(V,) code of each model vertex in `fit.regions.REGIONS`, found on first access.
 
         The paper's method follows every vertex, observed or not. Outside the region of a region fit
-        (`FitConfig.region`) nothing is seen.
+        (`FitConfig.region`) no vertex is observed.
         """
         return self.find_regions()
 
     @cached_property
     def landmarks(self) -> dict[str, FloatArray]:
-        """Name -> (3,) of the model's landmarks in the scan's frame and unit, on the dense surface if there is one.
+        """Name -> (3,) position of the model's landmarks in the scan's frame and unit, on the dense surface if any.
 
-        Empty where the model has no landmarks.
+        Empty if the model has no landmarks.
         """
         return dict(self.surface(stage="dense" if "dense" in self.stages else "final").landmarks)
 
     @cached_property
     def colours(self) -> Mapping[str, ByteArray]:
-        """(V, 3) uint8 of the surface at `final`, and at `dense` where there is one; empty of a scan without colours.
+        """(V, 3) uint8 colours of the surface at `final`, and at `dense` if any; empty if the scan has no colours.
 
         A vertex takes the colour of the closest point of the scan. Where the surface does not follow the scan, or the
         scan shows nothing, it is grey.
@@ -212,7 +214,7 @@ class FitResult:
 
     @property
     def iterations(self) -> dict[str, int]:
-        """Iterations done, by phase."""
+        """Number of iterations by phase."""
         return {
             f"phase_{phase}": max((s.iteration for s in self.history if s.phase == phase), default=0)
             for phase in (1, 2)
@@ -249,7 +251,7 @@ class FitResult:
         At `final` and `dense` it has the colours of the scan, see `colours`.
 
         Args:
-            model: the model that was fitted, which the result knows; it may be left out.
+            model: the model that was fitted; None uses the one that the result contains.
             stage: a name of `stages`.
 
         Raises:
@@ -258,7 +260,7 @@ class FitResult:
         if model is not None and model is not self.model and model.content_hash != self.model_hash:
             raise InputError(
                 f"{self.scan_name} was fitted with another model than the one given, whose surface would be wrong; "
-                "leave the model out, as the result knows its own."
+                "omit the model, as the result contains its own."
             )
         vertices = self._vertices(stage)
         landmarks = self.model.landmarks.positions(vertices)
@@ -267,13 +269,14 @@ class FitResult:
     def save(self, folder: str | PathLike[str], name: str = "", *, stages: bool = False) -> Path:
         """Write the files that `shapespace fit` writes, and return the path of the record, NAME.fit.json.
 
-        Record and surfaces are published together, and the row of coefficients.csv is put in; `report`, `view` and
-        `recognise` then take the folder. Of a scan or a model that was not read from a file the record tells no path,
-        so that these need `--model`, and show the raw scan only with `stages`.
+        Record and surfaces are published together, and the row of coefficients.csv is added; `report`, `view` and
+        `recognise` then accept the folder. If scan or model was not read from a file, the record contains no path, so
+        these commands need `--model`, and show the raw scan only with `stages`.
 
         Args:
-            folder: made if absent.
-            name: NAME of the files; empty for that of the scan, with a part of its hash where another scan has it.
+            folder: output folder, created if absent.
+            name: NAME of the files; empty for the name of the scan, with a part of its hash if another scan has that
+                name.
             stages: whether to write NAME.stages.npz too, for figures.
 
         Raises:
@@ -288,7 +291,7 @@ class FitResult:
         Args:
             what: `distances` from the fitted surface to the scan, `stages` of the fit, `overlay` of scan and model,
                 `histograms` of the distances, `coefficients`, `history` of the iterations, or `regions` of the model.
-            options: of that figure's function in `shapespace.report.figures`.
+            options: options of the figure's function in `shapespace.report.figures`.
 
         Raises:
             InputError: there is no such plot.
@@ -297,12 +300,12 @@ class FitResult:
         return lazy_import("plot_fit")(self, what, **options)
 
     def view(self, *, height_px: int = 720) -> OpenViewer:
-        """Open the viewer on this fit, in a notebook in the cell's own frame.
+        """Open the viewer on this fit; in a notebook, in the frame of the cell.
 
-        It is served to this machine alone, by a thread, until `close()` of what is returned or the end of the process.
+        A thread serves it to this machine only, until `close()` of the returned viewer or the end of the process.
 
         Args:
-            height_px: of the frame.
+            height_px: height of the frame, pixels.
 
         Raises:
             ShapespaceError: the extra `view` is not installed.
@@ -326,10 +329,10 @@ def carried_colours(colours: ByteArray, scan: Mesh, closest: ClosestPoints, seen
     """Return the colours (V, 3) at the closest points of a surface's vertices, between the scan's vertices linearly.
 
     Args:
-        colours: (S, 3) of the scan's vertices.
-        scan: its surface or points.
+        colours: (S, 3) colours of the scan's vertices.
+        scan: the scan, with triangles or only points.
         closest: the closest points of the scan to V vertices.
-        seen: (V,) False where the scan shows nothing that the surface follows: there it is `GREY`.
+        seen: (V,) False where the surface follows no part of the scan: there the colour is `GREY`.
     """
     if closest.triangle is None or closest.barycentric is None or scan.faces is None:
         interpolated = colours[closest.vertex]
@@ -339,7 +342,7 @@ def carried_colours(colours: ByteArray, scan: Mesh, closest: ClosestPoints, seen
     return np.where(seen[:, None], interpolated, np.uint8(GREY))
 
 
-STAGES_VERSION = 3  # of the file with the stages of a fit
+STAGES_VERSION = 3  # version of the file with the stages of a fit
 
 
 def stage_arrays(result: FitResult, model: ShapeModel) -> dict[str, npt.NDArray[Any]]:
@@ -347,11 +350,11 @@ def stage_arrays(result: FitResult, model: ShapeModel) -> dict[str, npt.NDArray[
 
     The picture frame has the origin and the axes of the model's frame and the size of the scan, in mm.
 
-    Of each stage the vertices (V, 3), the signed distances `model_to_scan_STAGE` (V,) and `scan_to_model_STAGE` (S,),
-    positive where the scan lies outside of the model, not-a-number at scan points beyond the model's rim. `scan` and
-    `scan_faces` are the scan as repaired; `regions` the codes of `fit.regions.REGIONS`; `history_*` each iteration,
-    with T (I, 3, 4) from the model's frame then to the picture frame. Of a scan with colours, `scan_colours`
-    (S, 3), `colours_final` and `colours_dense` (V, 3) are there too, uint8.
+    For each stage it contains the vertices (V, 3) and the signed distances `model_to_scan_STAGE` (V,) and
+    `scan_to_model_STAGE` (S,), positive where the scan lies outside of the model, not-a-number at scan points beyond
+    the model's rim. `scan` and `scan_faces` are the repaired scan; `regions` the codes of `fit.regions.REGIONS`;
+    `history_*` each iteration, with T (I, 3, 4) from the model's frame then to the picture frame. If the scan has
+    colours, it also contains `scan_colours` (S, 3), `colours_final` and `colours_dense` (V, 3), uint8.
     """
     T_picture_scan = picture_frame(result.T_scan_model, result.mm_per_scan_unit)
     arrays: dict[str, npt.NDArray[Any]] = {

@@ -1,4 +1,4 @@
-"""The scan as a fit sees it: its surface to be searched, its normals, its border."""
+"""The scan as the target of a fit: search structures of its surface, its normals, its border."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, BoolArray, FloatArray, IntArray, Mesh, Similarity
 
 _ROUNDS = 4
-"""Of finding how much the larger areas must make up for vertices that are drawn for certain."""
+"""Rounds in which the share of the larger areas is adjusted for vertices that are drawn for certain."""
 
 
 def mm_frame(scan: Mesh, mm_per_scan_unit: float) -> Similarity:
-    """Return T_mm_scan: from the scan's own frame to mm, near the origin, where float64 is finest."""
+    """Return T_mm_scan: from the scan's own frame to mm, near the origin, where float64 is most precise."""
     centre = np.median(scan.vertices, axis=0)
     return Similarity(mm_per_scan_unit, np.eye(3), -mm_per_scan_unit * centre)
 
 
 @dataclass(frozen=True, eq=False)
 class ScanTarget:
-    """A scan in its mm frame; what is made from it is made once, when it is first needed.
+    """A scan in its mm frame; derived data are computed once, on first access.
 
     Args:
         mesh: the scan.
@@ -36,7 +36,7 @@ class ScanTarget:
 
     @cached_property
     def engine(self) -> ClosestPointEngine:
-        """Search structure of the surface itself, or of the points where there are no triangles."""
+        """Search structure of the surface, or of the points if the scan has no triangles."""
         return build_engine(self.mesh)
 
     @cached_property
@@ -69,18 +69,19 @@ class ScanTarget:
 
     @property
     def normals(self) -> FloatArray:
-        """(S, 3) unit normals at the vertices; zero where no triangle gives one."""
+        """(S, 3) unit normals at the vertices; zero at vertices without a triangle of positive area."""
         return self._normals_and_areas[0]
 
     def draw(self, count: int | None, rng: np.random.Generator) -> IntArray:
-        """Return about `count` vertices, spread as evenly by area as that many can be; None for all.
+        """Return the indices of about `count` vertices, spread as evenly by area as possible; None for all.
 
-        Scanners and editors sample hair, rims and creases more densely; by number such parts would outvote the rest.
+        Scanners and editors sample hair, rims and creases more densely; equal weights would give such parts too much
+        influence.
         """
         areas = self._normals_and_areas[1]
         if count is None or count >= len(areas) or areas.sum() <= 0.0:
             return np.arange(len(areas), dtype=np.int32)
-        areas = np.minimum(areas, areas.mean())  # what outliers pull into spikes has much area and says little
+        areas = np.minimum(areas, areas.mean())  # spikes from outliers have a large area and little information
         share = areas * (count / areas.sum())
         for _ in range(_ROUNDS):
             share *= count / np.minimum(1.0, share).sum()
@@ -95,21 +96,21 @@ class ScanTarget:
 
 
 KINDS = {"sphere": 4, "box": 6, "landmarks": 1}
-"""How many numbers each kind of crop needs."""
+"""Number of values that each kind of crop needs."""
 _FEWEST = 30  # vertices; with fewer no fit has enough matches (`_FEWEST_MATCHES` of the robust method)
 
 
 @dataclass(frozen=True)
 class Crop:
-    """A part of space.
+    """A crop of the scan: a sphere, a box, or the surroundings of its landmarks.
 
     Args:
         kind: a name of `KINDS`.
-        numbers: of a sphere its centre and radius, of a box two opposite corners, all in the scan's own frame and unit;
-            of landmarks how near to one of them, mm.
+        numbers: centre and radius of a sphere, or two opposite corners of a box, in the scan's own frame and unit; or
+            the largest distance from the closest landmark, mm.
 
     Raises:
-        InputError: numbers that make no such part.
+        InputError: the numbers do not define such a crop.
     """
 
     kind: str
@@ -118,21 +119,21 @@ class Crop:
     def __post_init__(self) -> None:
         finite = all(np.isfinite(number) for number in self.numbers)
         if KINDS.get(self.kind) != len(self.numbers) or not finite:
-            raise _no_crop(self.text)
+            raise _crop_error(self.text)
         if self.kind != "box" and self.numbers[-1] <= 0:
             raise InputError(f"The crop {self.text!r} needs a radius above zero.")
 
     @property
     def text(self) -> str:
-        """As it is written on the command line."""
+        """The crop in the syntax of the command line."""
         return f"{self.kind}:{','.join(f'{number:g}' for number in self.numbers)}"
 
     @staticmethod
     def of(text: str) -> Crop:
-        """Return the crop that `text` tells, such as `sphere:0,0,0,90`.
+        """Return the crop that `text` specifies, such as `sphere:0,0,0,90`.
 
         Raises:
-            InputError: it tells none.
+            InputError: the text specifies no crop.
         """
         kind, _, numbers = text.partition(":")
         try:
@@ -140,23 +141,23 @@ class Crop:
         except ValueError as error:
             if isinstance(error, InputError):
                 raise
-            raise _no_crop(text) from error
+            raise _crop_error(text) from error
 
     def cut(
         self, scan: Mesh, model: ShapeModel, landmarks: Mapping[str, FloatArray] | None, unit: str
     ) -> tuple[Mesh, str]:
-        """Return what of `scan` lies inside, and a sentence on it.
+        """Return the part of `scan` inside the crop, and a sentence on it.
 
         Args:
-            scan: in its own frame and unit.
-            model: whose landmarks tell the unit of the scan's.
+            scan: the scan in its own frame and unit.
+            model: shape model, whose landmarks determine the unit of the scan's landmarks.
             landmarks: name -> (3,) of the scan.
-            unit: of the scan, or `auto`.
+            unit: unit of the scan, or `auto`.
 
         Raises:
-            FitError: hardly anything is left, or there are no landmarks to go by.
+            FitError: hardly any vertex is left, or the crop needs landmarks and there are none.
         """
-        inside = self._inside(scan, model, landmarks, unit)
+        inside = self._inside_mask(scan, model, landmarks, unit)
         if inside.sum() < _FEWEST:
             low, high = (np.array2string(f(scan.vertices, axis=0), precision=4) for f in (np.nanmin, np.nanmax))
             raise FitError(
@@ -166,7 +167,7 @@ class Crop:
         note = f"Cropped to {inside.sum():,} of {len(inside):,} vertices ({self.text})."
         return part_of(scan, inside), note
 
-    def _inside(
+    def _inside_mask(
         self, scan: Mesh, model: ShapeModel, landmarks: Mapping[str, FloatArray] | None, unit: str
     ) -> BoolArray:
         x = scan.vertices
@@ -178,19 +179,19 @@ class Crop:
         if not landmarks:
             raise FitError(f"{scan.name}: the crop {self.text} needs landmarks, and none are given for it.")
         points = np.stack(list(landmarks.values()))
-        mm = MM_PER_UNIT[unit if unit != "auto" else _unit(model, landmarks, scan.name)]
+        mm = MM_PER_UNIT[unit if unit != "auto" else _find_landmark_unit(model, landmarks, scan.name)]
         inside = np.zeros(len(x), dtype=np.bool_)
         for point in points:
             inside |= np.linalg.norm(x - point, axis=1) * mm <= self.numbers[0]
         return inside
 
 
-def _no_crop(text: str) -> InputError:
+def _crop_error(text: str) -> InputError:
     return InputError(f"There is no crop {text!r}; give sphere:X,Y,Z,R or box:X,Y,Z,X,Y,Z or landmarks:MM.")
 
 
-def _unit(model: ShapeModel, landmarks: Mapping[str, FloatArray], scan_name: str) -> str:
-    """Return the unit in which the landmarks lie about as far apart as the model's."""
+def _find_landmark_unit(model: ShapeModel, landmarks: Mapping[str, FloatArray], scan_name: str) -> str:
+    """Return the unit for which the landmarks are about as far apart as the model's."""
     shared = [name for name in model.landmarks if name in landmarks]
     there = rms_size(np.stack([landmarks[name] for name in shared])) if len(shared) > 1 else 0.0
     if there == 0.0:

@@ -1,8 +1,8 @@
-"""Identity and expression apart: x = mean + A a + B e, as a rotation of the coefficients of an ordinary shape model.
+"""Models with separate identity and expression: x = mean + A a + B e, as a rotation of a shape model's coefficients.
 
-A holds the modes of neutral shapes, B those of expression minus the same person's neutral. With a and e normal and
-independent, x has the covariance A La A^T + B Le B^T, whose eigenvectors are a shape model like any other: fitting that
-model is fitting a and e jointly, and [a; e] in standard deviations is its z, rotated. Source: method.md 8; Amberg,
+A contains the modes of neutral shapes, B those of expression minus the same person's neutral. With a and e normal and
+independent, x has the covariance A La A^T + B Le B^T, whose eigenvectors are a shape model like any other: a fit of
+that model is a joint fit of a and e, and [a; e] in standard deviations is its z, rotated. Source: method.md 8; Amberg,
 Knothe and Vetter, FG 2008, for the additive model of expressions.
 """
 
@@ -39,7 +39,7 @@ from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks, commo
 
 _STILL_ROUNDS = 3  # iterations of the alignment on the parts that expressions do not move
 _STILL_SHAPES = 60  # shapes, evenly spread, that show which vertices expressions move
-_NO_VARIANCE = 1e-10  # share of the first eigenvalue; below is rounding
+_NO_VARIANCE = 1e-10  # share of the first eigenvalue; below is rounding error
 _NO_MOTION_MM = 1e-6  # mm per coordinate; far below any scanner's resolution
 _LOCAL_MODES = 150  # local modes of identity that are added when the number of modes is automatic
 
@@ -51,8 +51,8 @@ class FitInformation:
     The precision and the information vector are the natural parameters of a normal distribution.
 
     Args:
-        precision: (K, K) of the scan alone.
-        vector: (K,) precision @ the estimate by the scan alone.
+        precision: (K, K) precision from the scan alone.
+        vector: (K,) precision @ the estimate from the scan alone.
     """
 
     precision: FloatArray
@@ -66,8 +66,8 @@ class AdditiveModel:
     All coefficients here are in standard deviations; `shape.to_b` has them in mm.
 
     Args:
-        shape: the model that fits: its covariance is that of identity plus that of expression.
-        rotation: (K, K) orthogonal; its first `n_identity` rows give a, the others e, in standard deviations.
+        shape: the shape model for fitting; its covariance is that of identity plus that of expression.
+        rotation: (K, K) orthogonal; its first `n_identity` rows map z to a, the others to e, in standard deviations.
         n_identity: number of identity coefficients.
 
     Raises:
@@ -114,33 +114,34 @@ class AdditiveModel:
     ) -> AdditiveModel:
         """Build the model of corresponding `meshes`, in mm.
 
-        The directions of the modes are those of all meshes, their variances those of people who took no part in them.
-        What a new face has outside the modes of identity belongs to smooth local modes beside them, which count as
-        identity, so that it is not read as an expression.
+        The directions of the modes are those of all meshes, their variances those of held-out people.
+        The part of a new face outside the modes of identity belongs to additional smooth local modes, which count as
+        identity, so that it is not interpreted as an expression.
 
         Args:
-            meshes: at least two neutral ones, and one or more expressions of people whose neutral is there.
-            subjects: (N,) whom each shows.
-            neutral: (N,) whether it is the neutral face; a person's neutrals are averaged.
+            meshes: corresponding meshes, at least two neutral ones, and one or more expressions of people whose neutral
+                is among them.
+            subjects: (N,) name of the person of each mesh.
+            neutral: (N,) whether each mesh is a neutral face; a person's neutrals are averaged.
             identity_modes: a number, fewer if the meshes determine fewer; a float below 1 for a share of the variance;
                 `all`.
-            expression_modes: the same for expressions.
-            local_identity_modes: how many smooth local modes of identity there are at most beside those of the people;
-                None for 150, or for none where `identity_modes` is a number. The less is left outside the people's,
-                the fewer are kept.
-            gauge: `shape` divides size out, `form` keeps it.
-            alignment_vertices: that carry the alignment, such as forehead and nose; None takes those that expressions
-                move least.
-            still_share: how many those are, as a share of all.
-            kin: (N,) names of those that are left out together when variances are found, such as a face and its mirror
-                image; None takes `subjects`.
-            landmarks: of the model: named points on the surface (`place_landmarks`), or name -> vertex.
-            provenance: what the meshes are, in words.
-            licence: of the meshes.
+            expression_modes: number of modes of expression, as for `identity_modes`.
+            local_identity_modes: maximum number of smooth local modes of identity, in addition to those of the people;
+                None for 150, or for none if `identity_modes` is a number. The less variance is outside the people's
+                modes, the fewer are kept.
+            gauge: `shape` removes size, `form` keeps it.
+            alignment_vertices: indices of the vertices that determine the alignment, such as forehead and nose; None
+                takes the vertices that expressions move least.
+            still_share: number of those vertices as a share of all.
+            kin: (N,) names of the groups that are held out together when variances are estimated, such as a face and
+                its mirror image; None takes `subjects`.
+            landmarks: landmarks of the model: named points on the surface (`place_landmarks`), or name -> vertex.
+            provenance: description of the meshes.
+            licence: licence of the meshes.
 
         Raises:
             CorrespondenceError: the meshes differ in vertices or triangles.
-            InputError: too few of them, or an expression without its person's neutral.
+            InputError: there are too few meshes, or an expression without its person's neutral.
         """
         identity_modes, expression_modes = plain_modes(identity_modes), plain_modes(expression_modes)
         meshes = [without_estimates(mesh) for mesh in as_meshes(meshes, "AdditiveModel.fit")]
@@ -148,8 +149,8 @@ class AdditiveModel:
         for mesh in meshes:
             if np.isnan(mesh.vertices).any():
                 raise InputError(
-                    f"{mesh.name}: vertices are missing, and a model that parts identity and expression needs whole "
-                    "meshes; leave --additive out, or the meshes with holes."
+                    f"{mesh.name}: vertices are missing, and a model that separates identity and expression needs "
+                    "complete meshes; omit --additive, or exclude the meshes with holes."
                 )
         neutrals, shapes, people, expressive = _neutrals_and_expressions(meshes, subjects, neutral, kin)
         row = np.array([people.index(subjects[i]) for i in expressive])
@@ -162,8 +163,8 @@ class AdditiveModel:
         if local_identity_modes is None:
             local_identity_modes = 0 if isinstance(identity_modes, int) else _LOCAL_MODES
         whose = [kin_of[name] for name in people], [kin_of[subjects[i]] for i in expressive]
-        mean, A, of_identity = _identity(neutrals, whose[0], identity_modes, local_identity_modes)
-        B, of_expression = _expression(shapes.reshape(len(shapes), -1), whose[1], expression_modes)
+        mean, A, of_identity = _identity_modes(neutrals, whose[0], identity_modes, local_identity_modes)
+        B, of_expression = _expression_modes(shapes.reshape(len(shapes), -1), whose[1], expression_modes)
         (basis, stddev), rotation = _as_shape_model(A, B)
         model = ShapeModel(
             mean=mean,
@@ -197,11 +198,11 @@ class AdditiveModel:
         Raises:
             InputError: another number of coefficients than the model's, or some that are not finite.
         """
-        t = self._checked(z) @ self.rotation.T
+        t = self._check_coefficients(z) @ self.rotation.T
         return t[..., : self.n_identity], t[..., self.n_identity :]
 
     def join_z(self, a: npt.ArrayLike, e: npt.ArrayLike) -> FloatArray:
-        """Return z (K,) of identity `a` and expression `e`, what `split` undoes; missing ones are zero.
+        """Return z (K,) of identity `a` and expression `e`, the inverse of `split`; missing coefficients are zero.
 
         An e of () is the neutral face.
 
@@ -232,17 +233,17 @@ class AdditiveModel:
 
         Args:
             z: (K,) coefficients, in standard deviations: `FitResult.z`.
-            z_covariance: (K, K) of them after the fit: `FitResult.z_covariance`. The diagonal alone will not do, since
-                identity and expression are known far better apart from each other than one by one.
+            z_covariance: (K, K) covariance of z after the fit: `FitResult.z_covariance`. The diagonal alone is not
+                enough, since the coefficients are correlated after the fit.
 
         Raises:
             InputError: arrays of other shapes, or no covariance.
         """
-        z, covariance = self._checked(z), np.asarray(z_covariance, dtype=np.float64)
+        z, covariance = self._check_coefficients(z), np.asarray(z_covariance, dtype=np.float64)
         k = self.shape.n_modes
         if z.ndim != 1 or covariance.shape != (k, k) or not np.isfinite(covariance).all():
             raise InputError(
-                f"Give ({k},) coefficients and their ({k}, {k}) covariance, as the robust method has them."
+                f"Give ({k},) coefficients and their ({k}, {k}) covariance, as the robust method returns them."
             )
         values, vectors = eigh(covariance)
         if values[0] <= 0:
@@ -253,22 +254,22 @@ class AdditiveModel:
     def tie(
         self, fits: Sequence[FitInformation], neutral: Sequence[bool] | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Return one identity and the expressions of several scans of one person, by all their fits together.
+        """Return one identity and the expressions of several scans of one person, from all their fits together.
 
-        The normal equations are block-arrow, so a is solved for first and each e after it. What identity has outside
+        The normal equations are block-arrow, so a is solved for first and each e after it. The part of identity outside
         the model is the same in all scans of a person and does not average out, so n scans, each with the prior of its
-        own e, count 1/n each: the same scan n times is the scan. For the same reason e is nearer the truth less the e
-        of a neutral scan tied with it.
+        own e, count 1/n each: the same scan n times has the result of one scan. For the same reason e is closer to the
+        truth after subtracting the e of a neutral scan of the same call.
 
         Args:
             fits: the information of each fit.
-            neutral: (n,) which scans are known to show the neutral face, with e = 0; None of them.
+            neutral: (n,) whether each scan is known to show the neutral face, with e = 0; None if no scan is.
 
         Returns:
             a (Ka,) and e (n, Ke), in standard deviations.
 
         Raises:
-            InputError: no scans, or another number of values of neutral.
+            InputError: there are no scans, or another number of values of `neutral`.
         """
         if not fits or (neutral is not None and len(neutral) != len(fits)):
             raise InputError("Pass at least one estimate of a fit, and one value of neutral for each or none.")
@@ -276,8 +277,8 @@ class AdditiveModel:
         left: FloatArray = np.eye(k)
         right: FloatArray = np.zeros(k)
         solves: list[FloatArray | None] = []
-        for number, one in enumerate(fits):
-            precision, vector = share * one.precision, share * one.vector
+        for number, fit in enumerate(fits):
+            precision, vector = share * fit.precision, share * fit.vector
             left, right = left + precision[:k, :k], right + vector[:k]
             if neutral is not None and neutral[number]:
                 solves.append(None)
@@ -304,24 +305,24 @@ class AdditiveModel:
         """Read a model written by `save`, or one of another tool that has modes of identity and of expression.
 
         Raises:
-            FileError: it cannot be read.
-            ModelFileError: it is damaged, of another version, or does not part identity and expression.
+            FileError: the file cannot be read.
+            ModelFileError: the file is damaged, of another version, or does not separate identity and expression.
         """
         if is_foreign(Path(path)):
             foreign = load_foreign(Path(path))
             model = model_of_foreign(foreign, Path(path))
             if isinstance(model, ShapeModel):
                 raise ModelFileError(
-                    f"{path} ({foreign.format}) does not part identity and expression; give one that does."
+                    f"{path} ({foreign.format}) does not separate identity and expression; give a model that does."
                 )
             return model
-        return _split(ShapeModel.load(path), Path(path))
+        return _read_additive(ShapeModel.load(path), Path(path))
 
     def as_linear(self) -> LinearModel:
-        """Return what formats of other tools can hold of the model, identity and expression parted."""
+        """Return the model as formats of other tools can represent it, with separate identity and expression."""
         return parted(self.shape.as_linear(), self.rotation, self.n_identity)
 
-    def _checked(self, z: npt.ArrayLike) -> FloatArray:
+    def _check_coefficients(self, z: npt.ArrayLike) -> FloatArray:
         array = np.asarray(z, dtype=np.float64)
         if array.ndim < 1 or array.shape[-1] != self.shape.n_modes or not np.isfinite(array).all():
             raise InputError(f"Give {self.shape.n_modes} finite coefficients for each shape, not {array.shape}.")
@@ -329,36 +330,36 @@ class AdditiveModel:
 
 
 def load_model(path: Path) -> ShapeModel | AdditiveModel:
-    """Return the model in `path`, parted where its file parts identity and expression.
+    """Return the model in `path`, as an `AdditiveModel` if its file separates identity and expression.
 
     Raises:
-        FileError: it cannot be read.
-        ModelFileError: it is damaged, of another version, or not a model.
+        FileError: the file cannot be read.
+        ModelFileError: the file is damaged, of another version, or not a model.
     """
     if is_foreign(path):
         return model_of_foreign(load_foreign(path), path)
     shape = ShapeModel.load(path)
     try:
-        return _split(shape, path)
+        return _read_additive(shape, path)
     except ModelFileError:
         return shape
 
 
 def model_of_foreign(foreign: Foreign, path: Path) -> ShapeModel | AdditiveModel:
-    """Return the model that `path` of another tool holds, parted where that file parts it.
+    """Return the model in the file `path` of another tool, as an `AdditiveModel` if the file separates its parts.
 
     Raises:
-        ModelFileError: its parts do not make a model.
+        ModelFileError: the parts do not make a model.
     """
     shape = ShapeModel.of_foreign(foreign, path)
     return shape if foreign.rotation is None else AdditiveModel(shape, foreign.rotation, foreign.n_identity)
 
 
-def _split(shape: ShapeModel, path: Path) -> AdditiveModel:
-    """Return `shape`, read from our file `path`, with what that file says of its two parts."""
+def _read_additive(shape: ShapeModel, path: Path) -> AdditiveModel:
+    """Return the additive model of `shape` and of the two parts that its shapespace file `path` describes."""
     arrays, attributes = read_hdf5(path)
     if "split_rotation" not in arrays or "split_identity" not in attributes:
-        raise ModelFileError(f"{path} does not part identity and expression; build it with --additive LABELS.csv.")
+        raise ModelFileError(f"{path} does not separate identity and expression; build it with --additive LABELS.csv.")
     try:
         return AdditiveModel(shape, arrays["split_rotation"].astype(np.float64), int(attributes["split_identity"]))
     except (InputError, ValueError, TypeError, OverflowError) as error:
@@ -370,7 +371,7 @@ def _neutrals_and_expressions(
 ) -> tuple[FloatArray, FloatArray, list[str], list[int]]:
     """Return each person's mean neutral (P, V, 3), the expressions (E, V, 3), the P people, and E indices of meshes."""
     if not len(meshes) == len(subjects) == len(neutral) == len(kin or subjects):
-        raise InputError("Give one subject and one word on neutral for each mesh, and kin for each or none.")
+        raise InputError("Give one subject and one value of neutral for each mesh, and kin for each or none.")
     own_neutrals: dict[str, list[FloatArray]] = {}
     for mesh, who, plain in zip(meshes, subjects, neutral, strict=True):
         if plain:
@@ -383,28 +384,28 @@ def _neutrals_and_expressions(
         )
     missing = sorted({subjects[i] for i in expressive} - set(own_neutrals))
     if missing:
-        raise InputError(f"There is no neutral face of {', '.join(missing[:5])}; add it, or leave them out.")
+        raise InputError(f"There is no neutral face of {', '.join(missing[:5])}; add it, or exclude these people.")
     neutrals = np.stack([np.asarray(np.mean(shapes, axis=0)) for shapes in own_neutrals.values()])
     expressions = np.stack([meshes[i].vertices for i in expressive])
     if not (np.isfinite(neutrals).all() and np.isfinite(expressions).all()):
         raise InputError(
-            "The training meshes hold vertices that are not finite; see shapespace check, and repair or leave them out."
+            "The training meshes have vertices that are not finite; see shapespace check, and repair or exclude them."
         )
     return neutrals, expressions, list(own_neutrals), expressive
 
 
 def still_vertices(neutrals: FloatArray, shapes: FloatArray, share: float = 0.3) -> IntArray:
-    """Return the vertices that move least from `neutrals` to `shapes`, both (N, V, 3): `share` of all.
+    """Return the vertices that move least from `neutrals` to `shapes`, both (N, V, 3): the share `share` of all.
 
-    They are found in turns with the alignment that they carry, on a part of the shapes evenly spread over all; on faces
-    they end on forehead, nose and the outer rim.
+    The search alternates with the alignment by these vertices, on a subset of the shapes spread evenly over all; on
+    faces the result is forehead, nose and the outer rim.
 
     Raises:
-        InputError: a share outside (0, 1], or one that leaves fewer than three vertices.
+        InputError: a share outside (0, 1], or a share of fewer than three vertices.
     """
     count = round(share * shapes.shape[1])
     if not 0 < share <= 1 or count < 3:
-        raise InputError(f"The share of still vertices must leave at least three of them, not {share}.")
+        raise InputError(f"The share of still vertices must leave at least three vertices, not {share}.")
     still: IntArray = np.arange(shapes.shape[1], dtype=np.int32)
     some = np.unique(np.linspace(0, len(shapes) - 1, _STILL_SHAPES).round().astype(np.int64))
     for _ in range(_STILL_ROUNDS):
@@ -416,27 +417,29 @@ def still_vertices(neutrals: FloatArray, shapes: FloatArray, share: float = 0.3)
     return still
 
 
-def _identity(
+def _identity_modes(
     neutrals: FloatArray, kin: Sequence[str], modes: int | float | None, most_local: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the mean (3V,), what one standard deviation of each mode does (3V, Ka), variance kept and left, mm^2."""
+    """Return the mean (3V,), modes times standard deviations (3V, Ka), and the variance inside and outside, mm^2."""
     flat = neutrals.reshape(len(neutrals), -1)
     components, centred = principal_components(flat, modes), flat - flat.mean(axis=0)
     gram = centred @ centred.T
     held = held_out_shapes(gram, kin, len(components.variance), centred=True)
-    variance = _of_new_people(gram / (len(flat) - 1), len(flat), held)
+    variance = _variances_of_new_people(gram / (len(flat) - 1), len(flat), held)
     L, of_local = local_modes(components.mean.reshape(-1, 3), components.basis, variance, held.left_mm2, most_local)
     directions = np.concatenate([components.basis, L], axis=1) * np.sqrt(np.concatenate([variance, of_local]))
     return components.mean, directions, np.array([variance.sum(), held.left_mm2])
 
 
-def _expression(moved: FloatArray, kin: Sequence[str], modes: int | float | None) -> tuple[FloatArray, FloatArray]:
-    """Return what one standard deviation of each mode does (3V, Ke), variance kept and left, mm^2."""
+def _expression_modes(
+    moved: FloatArray, kin: Sequence[str], modes: int | float | None
+) -> tuple[FloatArray, FloatArray]:
+    """Return modes times standard deviations (3V, Ke), and the variance inside and outside the modes, mm^2."""
     gram = moved @ moved.T
     B, sample = _modes_through_zero(moved, gram, modes)
     held = held_out_shapes(gram, kin, len(sample), centred=False)
-    # Modes through zero are one more than those through a mean.
-    variance = _of_new_people(gram / len(gram), len(gram) + 1, held)
+    # There is one more mode through zero than through a mean.
+    variance = _variances_of_new_people(gram / len(gram), len(gram) + 1, held)
     return B * np.sqrt(variance), np.array([variance.sum(), held.left_mm2])
 
 
@@ -445,7 +448,7 @@ def _modes_through_zero(
 ) -> tuple[FloatArray, FloatArray]:
     """Return modes (D, K) and second moments (K,) about zero of `data` (N, D), whose products are `gram` (N, N).
 
-    About zero and not the mean: neutral is zero, and an expression runs along a line through it.
+    About zero and not the mean: neutral is zero, and an expression lies on a line through it.
     """
     values, vectors = largest_eigenpairs(gram / len(data))
     total = float(values.sum())
@@ -462,8 +465,8 @@ def _modes_through_zero(
     return modes, values
 
 
-def _of_new_people(gram: FloatArray, n_shapes: int, held_out: HeldOut) -> FloatArray:
-    """Return variances (K,) of people who took no part in the modes, by the whole spectrum of `gram` (N, N)."""
+def _variances_of_new_people(gram: FloatArray, n_shapes: int, held_out: HeldOut) -> FloatArray:
+    """Return variances (K,) of people who took no part in the modes, from the complete spectrum of `gram` (N, N)."""
     spectrum = varying(eigh(gram, eigvals_only=True)[::-1])
     return variances_of_new_shapes(spectrum, float(spectrum.sum()), n_shapes, held_out)
 

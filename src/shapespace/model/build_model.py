@@ -1,4 +1,4 @@
-"""A shape model of meshes in correspondence: alignment, principal components, and the modes among them (P1-P5)."""
+"""Build a shape model from corresponding meshes: alignment, principal components, and the choice of modes (P1-P5)."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from shapespace.model.pca import Modes, PrincipalComponents, plain_modes, princi
 from shapespace.model.representation import Representation, Vertices, representation_named
 from shapespace.model.shape_model import ShapeModel, odd_size_notes
 from shapespace.model.streamed import (
-    Aligned,
+    AlignedShapes,
     KeptShapes,
     Meshes,
     Scratch,
     Tell,
     aligned_on_disk,
-    refuse_without_extent,
+    check_extent,
     streaming_note,
 )
 from shapespace.model.training_shapes import TrainingShapes
@@ -55,13 +55,13 @@ class BuildConfig:
         modes: number of modes (in Python also a float below 1, a share of the variance), fewer if the meshes determine
             fewer; `all`; `auto`: cross-validation on held-out vertices, of a random sample of 2,000 meshes if there are
             more, and `all` of fewer than four.
-        gauge: `form`: size is part of the modes, and fits are rigid; `shape`: size is divided out, and fits have a free
+        gauge: `form`: size is part of the modes, and fits are rigid; `shape`: size is removed, and fits have a free
             scale.
         align: whether to align the meshes.
-        alignment_vertices: indices of the vertices that determine the alignment, such as forehead and nose where
+        alignment_vertices: indices of the vertices that determine the alignment, such as forehead and nose if
             expressions vary; None for all.
         landmarks: landmarks of the model: named points on the surface (`place_landmarks`), or name -> vertex.
-        representation: what the modes move: `vertices`; `bspline`, control points of a smooth surface;
+        representation: quantities that the modes move: `vertices`; `bspline`, control points of a smooth surface;
             `bspline-detail`, the same with the detail of the mean that the B-spline cannot represent.
         control_points: control points of a B-spline along each side, 4 to 64 (default 24x24).
         min_seen: remove vertices that fewer than this share of the meshes show, with their triangles and landmarks,
@@ -69,9 +69,9 @@ class BuildConfig:
         provenance: description of the meshes, kept in the model file.
         licence: licence of the meshes, kept in the model file.
         seed: seed of the cross-validation, and of the first directions of streamed modes.
-        out_of_core: stream the meshes, each loaded once and not held, through a file of single precision as large as
-            they are: the same model but for that rounding, with `ShapeModel.residuals`. None does so where a model of
-            vertices would need more than four fifths of the free memory.
+        out_of_core: stream the meshes, each loaded once and not kept in memory, through a file of single precision as
+            large as they are: the same model except for that rounding, with `ShapeModel.residuals`. None does so if a
+            model of vertices would need more than four fifths of the free memory.
         without_training_shapes: omit the training shapes, from which their surfaces can be reconstructed, from the
             model, for example before you share a model of people; its results are then not calibrated.
 
@@ -98,7 +98,7 @@ class BuildConfig:
         """Check each option.
 
         Raises:
-            InputError: an option cannot be.
+            InputError: an option has an impossible value.
         """
         if self.modes != "auto":
             object.__setattr__(self, "modes", plain_modes(self.modes) or "all")
@@ -121,36 +121,36 @@ def build_model(
     """Build a shape model of meshes in correspondence, in mm (P1-P5).
 
     Args:
-        meshes: at least two, same vertices in the same order, same triangles: a list, or anything with a length
-            and items that loads a mesh when it is accessed. Items are anything that `as_mesh` takes: meshes, paths,
-            arrays (V, 3) of points, or objects of other tools. A folder of meshes does too. Vertices that are
-            not-a-number or not observed are missing: a model of vertices learns from the others, one of B-splines from
-            filled ones.
+        meshes: two or more meshes with the same vertices in the same order and the same triangles: a list, any object
+            with a length and items that loads a mesh when it is accessed, or a folder of meshes. Items are inputs of
+            `as_mesh`: meshes, paths, arrays (V, 3) of points, or objects of other tools. Vertices that are
+            not-a-number or not observed are missing: a model of vertices is estimated from the others, a model of
+            B-splines from filled meshes.
         config: options; None for the defaults.
-        scratch: for the file of streamed meshes, and for what a build that is killed goes on with; None takes the
-            system's folder for temporary files and does not go on.
-        keep_shapes: a folder to keep that file in, for `extend_model`; the meshes are then streamed.
-        log: called with the name of each step while meshes are streamed.
+        scratch: folder for the file of streamed meshes, and for the data from which a build that was killed continues;
+            None takes the system's folder for temporary files and does not continue.
+        keep_shapes: folder to keep that file in, for `extend_model`; the meshes are then streamed.
+        log: function called with the name of each step while meshes are streamed.
 
     Raises:
         CorrespondenceError: the meshes differ in vertices or triangles.
-        MeshError: for B-splines: the surface cannot be spread out on a square.
+        MeshError: for B-splines: the surface cannot be mapped to a square.
         InputError: too few meshes, values that are not finite, no variation, an unknown representation,
-            control points that cannot be; streamed meshes with missing vertices, or for B-splines.
+            impossible control points; streamed meshes with missing vertices, or for B-splines.
         FileError: the disk has no room for the file.
 
     Example:
         >>> ss.build_model(meshes, ss.BuildConfig(modes=3)).n_modes
         3
     """
-    config, log = config or BuildConfig(), log or _silent
+    config, log = config or BuildConfig(), log or _log_nothing
     require(config, BuildConfig, "build_model", "give the options as BuildConfig(...)")
     align, alignment_vertices = config.align, config.alignment_vertices
     landmarks: Mapping[str, int] = config.landmarks or {}
     meshes = as_meshes(meshes, "build_model")
     kind = representation_named(config.representation, config.control_points)
     if kind is not Vertices and (config.out_of_core or keep_shapes is not None):
-        raise InputError("Only models of vertices can be made of streamed meshes; leave --representation out.")
+        raise InputError("Only models of vertices can be built from streamed meshes; omit --representation.")
     streaming = ""
     if kind is Vertices and keep_shapes is None:
         streaming = streaming_note(meshes, modes=config.modes, out_of_core=config.out_of_core)
@@ -163,11 +163,11 @@ def build_model(
             scratch=scratch,
             onto=None,
             modes=config.modes,
-            tell=log,
+            log=log,
         )
         if len(meshes):
             SurfaceLandmarks.of(landmarks).check(len(meshes[0].vertices))
-        model = _of_streamed(stream, meshes, config, landmarks, keep_shapes, log)
+        model = _model_of_streamed(stream, meshes, config, landmarks, keep_shapes, log)
         return replace(model, notes=[streaming, *model.notes]) if streaming else model
     meshes = [without_estimates(meshes[index]) for index in range(len(meshes))]
     faces, dropped = common_faces(meshes), np.zeros(0, dtype=np.int32)
@@ -181,9 +181,11 @@ def build_model(
     shapes, names = _training_shapes(meshes, faces, fill=kind.takes_holes), [mesh.name for mesh in meshes]
     rounding = rounding_mm(np.nan_to_num(meshes[0].vertices, posinf=0.0, neginf=0.0))
     observed = np.asarray(np.isfinite(shapes).all(axis=2), dtype=np.bool_)
-    sizes = _sizes(shapes, observed)
-    shapes, completed = _aligned(shapes, names, config.gauge, align=align, alignment_vertices=alignment_vertices)
-    sizes = sizes / _sizes(shapes, observed)
+    sizes = _centroid_sizes(shapes, observed)
+    shapes, completed = _align_training_shapes(
+        shapes, names, config.gauge, align=align, alignment_vertices=alignment_vertices
+    )
+    sizes = sizes / _centroid_sizes(shapes, observed)
     # Coding overwrites the shapes of B-splines.
     aligned = shapes if kind is Vertices or config.without_training_shapes else shapes.copy()
     coder = kind.of(Mesh(shapes.mean(axis=0), faces, name="The mean of the meshes"), config.control_points)
@@ -194,7 +196,7 @@ def build_model(
         pc = principal_components(data, number_of_modes(config.modes, data, config.seed))
     else:
         pc = _components_of_codes(coder, shapes, config.modes, config.seed)
-    model = _of_components(
+    model = _model_of_components(
         pc,
         coder,
         modes=config.modes,
@@ -209,7 +211,7 @@ def build_model(
         licence=config.licence,
         dropped_vertices=dropped,
     )
-    model = _finished(model, aligned.__getitem__, names.__getitem__, sizes, config)
+    model = _finish_model(model, aligned.__getitem__, names.__getitem__, sizes, config)
     return replace(model, notes=[*notes, *model.notes])
 
 
@@ -223,32 +225,32 @@ def extend_model(
     keep_shapes: Path | None = None,
     log: Tell | None = None,
 ) -> ShapeModel:
-    """Return the model of the shapes that `model` was made of and of `meshes`, without the first ones' meshes.
+    """Return the model of the training shapes of `model` and of `meshes`, without the meshes of the former.
 
-    It is the model that `build_model` makes of all of them, but for rounding to single precision: all shapes are
-    aligned anew, beginning from the poses that are known.
+    The result equals that of `build_model` for all these meshes, except for rounding to single precision: all shapes
+    are aligned again, starting from the known poses.
 
     Args:
         model: a model that was built with its shapes kept.
-        meshes: at least one, corresponding to the model.
-        shapes: the folder that `build_model` was given as `keep_shapes`.
+        meshes: one or more meshes in correspondence with the model.
+        shapes: folder that `build_model` received as `keep_shapes`.
         config: modes and seed; provenance and licence of the new model, empty for those of `model`. Everything else
             is that of `model`.
-        scratch: as of `build_model`.
-        keep_shapes: a folder to keep all shapes in, other than `shapes`.
-        log: as of `build_model`.
+        scratch: folder for temporary data, see `build_model`.
+        keep_shapes: folder to keep all shapes in, other than `shapes`.
+        log: function called with the name of each step, see `build_model`.
 
     Raises:
         CorrespondenceError: a mesh differs from the model in vertices or triangles.
-        InputError: shapes of another model, or what `build_model` refuses.
+        InputError: the shapes are those of another model, or `build_model` rejects the input.
         FileError: there are no shapes, or the disk is full.
     """
-    config, log = config or BuildConfig(), log or _silent
+    config, log = config or BuildConfig(), log or _log_nothing
     training = KeptShapes.load(shapes)
     if training.model_hash != model.content_hash:
         raise InputError(f"The shapes in {shapes} are those of another model; give the model that was built with them.")
     if not len(meshes):
-        raise InputError("There are no meshes to be added; give at least one.")
+        raise InputError("There are no meshes to add; give at least one.")
     training.check()
     stream = aligned_on_disk(
         meshes,
@@ -258,18 +260,18 @@ def extend_model(
         scratch=scratch,
         onto=training,
         modes=config.modes,
-        tell=log,
+        log=log,
     )
     config = replace(config, provenance=config.provenance or model.provenance, licence=config.licence or model.licence)
-    return _of_streamed(stream, meshes, config, model.landmarks, keep_shapes, log)
+    return _model_of_streamed(stream, meshes, config, model.landmarks, keep_shapes, log)
 
 
-def _silent(_: str) -> None:
+def _log_nothing(_: str) -> None:
     pass
 
 
-def _of_streamed(
-    stream: AbstractContextManager[Aligned],
+def _model_of_streamed(
+    stream: AbstractContextManager[AlignedShapes],
     meshes: Meshes,
     config: BuildConfig,
     landmarks: Mapping[str, int],
@@ -278,7 +280,7 @@ def _of_streamed(
 ) -> ShapeModel:
     with stream as aligned:
         training = aligned.training
-        model = _of_components(
+        model = _model_of_components(
             aligned.components(config.modes, config.seed, log),
             Vertices(),
             modes=config.modes,
@@ -293,7 +295,7 @@ def _of_streamed(
         )
         sizes = np.ones(len(training.sizes)) if config.without_training_shapes else aligned.relative_sizes()
         before = training.sizes.size - len(meshes)
-        model = _finished(
+        model = _finish_model(
             model,
             aligned.shape,
             lambda i: f"shape {i + 1} of the model" if i < before else meshes[i - before].name,
@@ -305,12 +307,12 @@ def _of_streamed(
     return model
 
 
-def _sizes(shapes: FloatArray, observed: BoolArray) -> FloatArray:
+def _centroid_sizes(shapes: FloatArray, observed: BoolArray) -> FloatArray:
     """Return the centroid sizes (N,) of the observed vertices of shapes (N, V, 3)."""
     return np.array([centroid_size(shapes[i, observed[i]]) for i in range(len(shapes))])
 
 
-def _finished(
+def _finish_model(
     model: ShapeModel,
     shape: Callable[[int], FloatArray],
     name: Callable[[int], str],
@@ -320,10 +322,10 @@ def _finished(
     """Return the model with a note on mirrored shapes, and with its training shapes, unless `config` omits them.
 
     Args:
-        model: without them.
-        shape: returns the vertices (V, 3) of an aligned shape by its index.
-        name: returns the name of a shape by its index.
-        sizes: (N,) before alignment, relative to those after it.
+        model: the model without training shapes.
+        shape: function that returns the vertices (V, 3) of an aligned shape by its index.
+        name: function that returns the name of a shape by its index.
+        sizes: (N,) sizes before alignment, relative to those after it.
         config: options.
     """
     odd = odd_size_notes(model.mean_vertices)
@@ -335,7 +337,7 @@ def _finished(
     return replace(model, training=training)
 
 
-def _of_components(
+def _model_of_components(
     pc: PrincipalComponents,
     coder: Representation,
     *,
@@ -346,21 +348,21 @@ def _of_components(
     gauge: Gauge,
     **about: Any,
 ) -> ShapeModel:
-    """Return the model of these components, without modes that no shape made."""
+    """Return the model of these components, without modes that result from alignment or rounding alone."""
     mean = coder.decode(pc.mean)
     spurious = below_precision(pc.variance, pc.n_samples, mean.size, rounding)
     if align:
         spurious |= made_by_alignment(mean, coder.directions(pc.basis), gauge, alignment_vertices)
     if spurious.all():
         raise InputError(
-            "The training meshes differ by no more than their alignment and their rounding make of them, so there "
-            "is no variation to model; give different ones."
+            "The training meshes differ only by their alignment and their rounding, so there is no variation to model; "
+            "give different meshes."
         )
     kept, left_out = int((~spurious).sum()), int(spurious.sum())
     notes = modes_notes(modes, kept, pc.n_samples)
     if left_out:
         count_text = "1 mode is" if left_out == 1 else f"{left_out} modes are"
-        notes.append(f"{count_text} left out, since alignment or rounding made them and no shape did.")
+        notes.append(f"{count_text} omitted, because alignment or rounding alone causes such modes.")
     return ShapeModel(
         mean=pc.mean,
         basis=pc.basis[:, ~spurious],
@@ -376,7 +378,7 @@ def _of_components(
     )
 
 
-def _aligned(
+def _align_training_shapes(
     shapes: FloatArray, names: Sequence[str], gauge: Gauge, *, align: bool, alignment_vertices: IntArray | None
 ) -> tuple[FloatArray, CompletedShapes | None]:
     """Return the training shapes (N, V, 3) aligned and complete, and how they were completed; `shapes` is overwritten.
@@ -386,7 +388,7 @@ def _aligned(
     """
     if align:
         for shape, name in zip(shapes, names, strict=True):
-            refuse_without_extent(shape, name)
+            check_extent(shape, name)
     if np.isnan(shapes).any():
         completed = complete(shapes, names, gauge, align=align, alignment_vertices=alignment_vertices)
         return completed.shapes, completed
@@ -396,7 +398,7 @@ def _aligned(
 def _components_of_codes(coder: Representation, shapes: FloatArray, modes: Modes, seed: int) -> PrincipalComponents:
     """Return mean and basis in codes, orthonormal in the vertices that they decode to; `shapes` is overwritten.
 
-    What coding loses counts as variance that the modes leave over.
+    The variation that coding loses counts as variance outside the modes.
     """
     centre = shapes.mean(axis=0)
     total = sum(float(((shape - centre) ** 2).sum()) for shape in shapes) / (len(shapes) - 1)
@@ -412,65 +414,63 @@ def _components_of_codes(coder: Representation, shapes: FloatArray, modes: Modes
 
 
 def _training_shapes(meshes: Sequence[Mesh], faces: IntArray | None, *, fill: bool) -> FloatArray:
-    """Return the vertices of training meshes, (N, V, 3), checked; `fill` says whether what is missing is filled."""
+    """Return the vertices of training meshes, (N, V, 3), checked; `fill` is whether missing vertices are filled."""
     if len(meshes) < 2:
-        raise InputError(
-            f"A shape model needs at least two meshes, not {len(meshes)}; with one there is nothing that varies."
-        )
+        raise InputError(f"A shape model needs at least two meshes, not {len(meshes)}; one mesh has no variation.")
     shapes = np.stack([mesh.vertices for mesh in meshes])
     names = [mesh.name for mesh in meshes]
     if fill and np.isnan(shapes).any():
-        _refuse_not_finite(np.where(np.isnan(shapes), 0.0, shapes), names)
+        _check_finite(np.where(np.isnan(shapes), 0.0, shapes), names)
         fill_holes(shapes, faces, names)
-    _refuse_not_finite(np.nan_to_num(shapes, nan=0.0, posinf=np.inf, neginf=-np.inf) if not fill else shapes, names)
-    _refuse_equal(shapes)
+    _check_finite(np.nan_to_num(shapes, nan=0.0, posinf=np.inf, neginf=-np.inf) if not fill else shapes, names)
+    _check_variation(shapes)
     return shapes
 
 
-def _refuse_not_finite(values: FloatArray, names: Sequence[str]) -> None:
+def _check_finite(values: FloatArray, names: Sequence[str]) -> None:
     finite = np.isfinite(values).all(axis=(1, 2))
     if not finite.all():
         raise InputError(
-            f"{names[int(np.argmin(finite))]} holds vertices that are not finite; see shapespace check, and repair it "
-            "or leave it out."
+            f"{names[int(np.argmin(finite))]} has vertices that are not finite; see shapespace check, and repair or "
+            "exclude this mesh."
         )
 
 
-def _refuse_equal(shapes: FloatArray) -> None:
-    """Refuse training shapes without extent or variation before alignment turns rounding into modes."""
+def _check_variation(shapes: FloatArray) -> None:
+    """Raise if training shapes have no extent or no variation, before alignment turns rounding into modes."""
     spread = float((np.nanmax(shapes, axis=0) - np.nanmin(shapes, axis=0)).max())
     if spread <= 64 * np.finfo(float).eps * float(np.nanmax(np.abs(shapes))):
         raise InputError("The training meshes are all equal, so there is no variation to model; give different ones.")
 
 
 _ROUNDS = 5  # iterations of spline and alignment to fill holes
-_COUNTS = (16, 16)  # control points along each side, since fill-ins are to be smooth
+_COUNTS = (16, 16)  # control points along each side, since filled vertices must be smooth
 _SMOOTHNESS = 4e-7
-"""With this, vertices of ICT-FaceKit are filled best: 1.7 mm off, where the mean alone is 3.6 mm off."""
+"""Chosen on ICT-FaceKit: filled vertices have an error of 1.7 mm, those of the mean alone 3.6 mm."""
 _PULL = 1e-3
-"""Weight with which a missing vertex stays at the mean, beside 1 of one that is there."""
+"""Weight of a missing vertex at the mean, relative to 1 for an observed vertex."""
 
 
 def fill_holes(shapes: FloatArray, faces: IntArray | None, names: Sequence[str]) -> None:
     """Fill the vertices of `shapes` (N, V, 3) that are not-a-number, in place; each shape stays in its own pose.
 
-    A filled vertex lies where the mean of all shapes has it, moved as the seen vertices around it differ from that
-    mean: by the B-spline of least thin-plate energy. What is filled varies less than what was measured.
+    A filled vertex is that of the mean of all shapes, displaced like the observed vertices around it
+    by the B-spline of least thin-plate energy. Filled vertices vary less than measured ones.
 
     Args:
-        shapes: mm, in any poses; a vertex is missing where one of its coordinates is not-a-number.
-        faces: (F, 3) of all shapes.
-        names: of the shapes, for messages.
+        shapes: (N, V, 3) mm, in any poses; a vertex is missing if one of its coordinates is not-a-number.
+        faces: (F, 3) triangles of all shapes.
+        names: names of the shapes, for messages.
 
     Raises:
-        InputError: a vertex that no shape has, or a shape of which too little is there.
-        MeshError: the surface cannot be spread out on a square.
+        InputError: a vertex is missing in all shapes, or too little of a shape is observed.
+        MeshError: the surface cannot be mapped to a square.
     """
     seen: BoolArray = np.logical_and.reduce(np.isfinite(shapes), axis=2)
     nowhere = np.flatnonzero(~seen.any(axis=0))
     if len(nowhere):
         raise InputError(
-            f"Vertex {nowhere[0]} is missing in every mesh, so nothing is known of it; take it out of all."
+            f"Vertex {nowhere[0]} is missing in every mesh, so it cannot be estimated; remove it from all meshes."
         )
     first = int(seen.sum(axis=1).argmax())
     T_mean_shape = [

@@ -1,4 +1,4 @@
-"""From a model of another tool to one of ours and back: orthonormal modes in mm, with variances."""
+"""Conversion between models of other tools and shape models: orthonormal modes in mm, with variances."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ OWN_ENDINGS = (".h5", ".hdf5")
 
 @dataclass(frozen=True, eq=False)
 class Foreign:
-    """What a model file of another tool holds, as ours would.
+    """Content of a model file of another tool, as a shape model would represent it.
 
     Args:
-        fields: of the shape model; of identity and expression together where the file parts them.
-        rotation: (K, K) from z to identity and expression, or None where the file does not part them.
-        n_identity: how many rows of `rotation` are identity.
-        format: the format in words.
-        notes: sentences on what was kept, changed or left out.
+        fields: fields of the shape model; of identity and expression together if the file separates them.
+        rotation: (K, K) rotation from z to identity and expression; None if the file does not separate them.
+        n_identity: number of rows of `rotation` that are identity.
+        format: name of the format in words.
+        notes: sentences on properties that were kept, changed or omitted.
     """
 
     fields: ModelFields
@@ -36,39 +36,40 @@ class Foreign:
 
 
 def is_foreign(path: Path) -> bool:
-    """Whether `path` is there and is a model of another tool."""
+    """Whether `path` exists and is a model of another tool."""
     if is_ours(path):
         return False
-    from shapespace.formats.registry import is_known  # all formats, a third of what it takes to load a model
+    from shapespace.formats.registry import is_known  # all formats, a third of the time to load a model
 
     return is_known(path)
 
 
 def looks_like_model(path: Path) -> bool:
-    """Whether `path` is named as a model of shapespace, or is one of another tool."""
+    """Whether `path` is named as a model of shapespace, or is a model of another tool."""
     return (path.suffix.lower() in OWN_ENDINGS and not path.is_dir()) or is_foreign(path)
 
 
 def load_foreign(path: Path, mm: float | None = None, expressions: Path | None = None) -> Foreign:
-    """Return the model in `path`, in whatever format of another tool it is.
+    """Return the model in `path`, in any known format of another tool.
 
     Args:
         path: a file or a folder.
-        mm: how many mm one unit of it is; None for what its format says, or 1.
-        expressions: a file of blendshapes that belong to it, in the same unit; None for those that it brings.
+        mm: length of one unit of the file, mm; None for the unit that its format states, or 1.
+        expressions: file of blendshapes of the model, in the same unit; None for those in the file of the model.
 
     Raises:
-        FileError: it cannot be read.
-        ModelFileError: it is in no known format, damaged, or holds no variation; or the expressions are of another.
+        FileError: the file cannot be read.
+        ModelFileError: the file is in no known format, damaged, or contains no variation; or the expressions are those
+            of another model.
     """
     from shapespace.formats.registry import read_linear
 
     model_format, linear = read_linear(path)
     if expressions is not None:
-        linear = _with_expressions(linear, path, expressions)
+        linear = _add_expressions(linear, path, expressions)
     notes = list(linear.notes)
     if mm is None and linear.mm is None:
-        notes.append("The file names no unit; mm are taken.")
+        notes.append("The file states no unit; mm are assumed.")
     mm = mm or linear.mm or 1.0
     if mm != 1.0:
         notes.append(f"Lengths are multiplied by {mm:g} to be mm.")
@@ -77,15 +78,15 @@ def load_foreign(path: Path, mm: float | None = None, expressions: Path | None =
         moved = np.concatenate([moved, linear.expression.moved], axis=1)
     basis, stddev, right = orthonormal(moved * mm)
     if not len(stddev):
-        raise ModelFileError(f"{path} holds no variation, only a mean; read that as a mesh instead.")
-    notes += _changes(moved, len(stddev), parted=linear.expression is not None)
+        raise ModelFileError(f"{path} contains no variation, only a mean; read that as a mesh instead.")
+    notes += _describe_changes(moved, len(stddev), parted=linear.expression is not None)
     rotation = None
     if linear.expression is not None and len(stddev) == moved.shape[1]:
         rotation = right
     elif linear.expression is not None:
         notes.append("Identity and expression share modes, so they cannot be separated and are treated as one.")
     if linear.n_training is None and not linear.held_out:
-        notes.append(f"It does not say of how many shapes it was made; {len(stddev) + 1} are taken.")
+        notes.append(f"It does not state the number of its training shapes; {len(stddev) + 1} are assumed.")
     fields: ModelFields = {
         "mean": linear.mean.ravel() * mm,
         "basis": basis,
@@ -93,7 +94,7 @@ def load_foreign(path: Path, mm: float | None = None, expressions: Path | None =
         "total_variance": _total_variance(linear, stddev, mm),
         "n_training": linear.n_training or len(stddev) + 1,
         "faces": linear.faces,
-        # Others align rigidly and leave size in the modes.
+        # Other tools align rigidly and leave size in the modes.
         "gauge": "form",
         "landmarks": replace(linear.landmarks, distance_mm=linear.landmarks.distance_mm * mm),
         "representation": "vertices",
@@ -112,7 +113,7 @@ def load_foreign(path: Path, mm: float | None = None, expressions: Path | None =
 
 
 def _total_variance(linear: LinearModel, stddev: FloatArray, mm: float) -> float:
-    """Return the total variance that the file states, mm^2, if it does and it is above that of the modes."""
+    """Return the total variance that the file states, mm^2, if above that of the modes, else that of the modes."""
     of_modes = float((stddev**2).sum())
     total = 0.0
     for block in (linear.shape, linear.expression):
@@ -124,12 +125,12 @@ def _total_variance(linear: LinearModel, stddev: FloatArray, mm: float) -> float
 
 
 def as_linear(fields: ModelFields, mean: FloatArray, directions: FloatArray) -> LinearModel:
-    """Return what other formats can hold of a model of ours.
+    """Return the part of a shape model that other formats can represent.
 
     Args:
-        fields: of the model.
-        mean: (V, 3) its vertices, mm.
-        directions: (3V, K) how vertices move with each coefficient, mm.
+        fields: fields of the model.
+        mean: (V, 3) vertices of the mean, mm.
+        directions: (3V, K) displacements of the vertices by each coefficient, mm.
     """
     left = fields["total_variance"]
     return LinearModel(
@@ -146,34 +147,34 @@ def as_linear(fields: ModelFields, mean: FloatArray, directions: FloatArray) -> 
 
 
 def parted(linear: LinearModel, rotation: FloatArray, n_identity: int) -> LinearModel:
-    """Return `linear` with its modes turned into those of identity and of expression: z = rotation.T @ [a; e]."""
+    """Return `linear` with its modes rotated into those of identity and of expression: z = rotation.T @ [a; e]."""
     moved = linear.shape.moved @ rotation.T
     total = linear.shape.total_variance
     return replace(
         linear,
         shape=Modes(moved[:, :n_identity], total_variance=total),
-        # That of both is held by the shape alone.
+        # The block of the shape alone has the total variance of both.
         expression=Modes(moved[:, n_identity:], total_variance=None if total is None else 0.0),
     )
 
 
-def _with_expressions(linear: LinearModel, path: Path, expressions: Path) -> LinearModel:
+def _add_expressions(linear: LinearModel, path: Path, expressions: Path) -> LinearModel:
     from shapespace.formats.eos import read_blendshapes
 
     block = read_blendshapes(expressions)
     if linear.expression is not None:
-        raise ModelFileError(f"{path} has expressions of its own; leave those in {expressions} out.")
+        raise ModelFileError(f"{path} has expressions of its own; omit those in {expressions}.")
     if len(block.moved) != linear.mean.size:
         raise ModelFileError(
-            f"{expressions} is of {len(block.moved) // 3} vertices, and {path} has {len(linear.mean)}; give the "
+            f"{expressions} has {len(block.moved) // 3} vertices, and {path} has {len(linear.mean)}; give the "
             "blendshapes of that model."
         )
     combined = replace(linear, expression=block)
     combined.check(expressions)
-    return combined.noting(f"A weight of one of the {block.moved.shape[1]} blendshapes is one standard deviation.")
+    return combined.noting(f"A weight of 1 of the {block.moved.shape[1]} blendshapes is one standard deviation.")
 
 
-def _changes(moved: FloatArray, count: int, *, parted: bool) -> list[str]:
+def _describe_changes(moved: FloatArray, count: int, *, parted: bool) -> list[str]:
     length = np.linalg.norm(moved, axis=0)
     varies = length > 0
     unit = moved[:, varies] / length[varies]
@@ -181,7 +182,7 @@ def _changes(moved: FloatArray, count: int, *, parted: bool) -> list[str]:
     notes: list[str] = []
     if skew > ORTHOGONAL:
         subject = "Modes of identity and expression were" if parted else "The basis was"
-        notes.append(f"{subject} not orthonormal (by {skew:.2g}) and made so, which keeps the covariance.")
+        notes.append(f"{subject} not orthonormal (by {skew:.2g}) and orthonormalised, which keeps the covariance.")
     if count < moved.shape[1]:
-        notes.append(f"{moved.shape[1] - count} of {moved.shape[1]} modes do not vary and are left out.")
+        notes.append(f"{moved.shape[1] - count} of {moved.shape[1]} modes do not vary and are omitted.")
     return notes

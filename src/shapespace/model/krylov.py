@@ -1,8 +1,8 @@
-"""The leading eigenvectors of a large symmetric matrix that is known by its products alone: block Krylov.
+"""Leading eigenvectors of a large symmetric matrix from its products alone: block Krylov.
 
 Block Lanczos with full reorthogonalisation and Rayleigh-Ritz over all blocks: Golub and Underwood, Mathematical
-Software III, 1977; Musco and Musco, NeurIPS 2015, for how few products it takes. Each step is one product, so where the
-matrix is that of shapes on a disk, one pass over them.
+Software III, 1977; Musco and Musco, NeurIPS 2015, for the small number of products. Each step is one product, so if the
+matrix is that of shapes on a disk, one pass over the shapes.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from shapespace.io.containers.archives import kept_arrays, write_arrays
 from shapespace.types import FloatArray
 
 _DEPENDENT = 1e-13
-"""New directions shorter than this share of the first eigenvalue are rounding."""
+"""New directions shorter than this share of the first eigenvalue are rounding errors."""
 
 
-class Leading(NamedTuple):
+class LeadingEigenpairs(NamedTuple):
     """Eigenvalues and eigenvectors.
 
     Args:
-        values: (K,), falling.
-        vectors: (D, K), orthonormal.
-        residuals: (K,) |C v - lambda v| of each, as found by a product with them.
+        values: (K,) eigenvalues, falling.
+        vectors: (D, K) orthonormal eigenvectors.
+        residuals: (K,) |C v - lambda v| of each eigenvector, from a product with it.
     """
 
     values: FloatArray
@@ -37,12 +37,12 @@ class Leading(NamedTuple):
 
 @dataclass(frozen=True)
 class Stop:
-    """When the eigenvectors are good enough: |C v - lambda v| bounds how far each is turned, by its gap.
+    """Stopping rule for the eigenvectors: |C v - lambda v| bounds the rotation of each, by its gap.
 
     Args:
-        radians: that a mode may be turned by.
-        least_gap: eigenvalues nearer than this share of the first are not separated.
-        enough: residual, as a share of the first eigenvalue, that will do where the basis may not grow any more.
+        radians: largest angle of a mode to the exact one, radians.
+        least_gap: smallest gap, as a share of the first eigenvalue, of eigenvalues that are separated.
+        enough: residual, as a share of the first eigenvalue, that is sufficient if the basis cannot grow any more.
     """
 
     radians: float = 1e-6
@@ -50,7 +50,7 @@ class Stop:
     enough: float = 1e-6
 
     def reached(self, values: FloatArray, residuals: FloatArray) -> bool:
-        """Return whether all modes are: `values` (K + 1,) with the next one, `residuals` (K,)."""
+        """Return whether all modes are converged: `values` (K + 1,) with the next eigenvalue, `residuals` (K,)."""
         steps = -np.diff(values)
         gaps = np.minimum(steps, np.concatenate([steps[:1], steps[:-1]]))
         return bool((residuals <= self.radians * np.maximum(gaps, self.least_gap * values[0])).all())
@@ -68,21 +68,22 @@ def leading(
     seed: int = 0,
     passes: Path | None = None,
     on_pass: Callable[[int, float], None] | None = None,
-) -> Leading | None:
-    """Return the leading eigenvectors of C (D, D); None where a basis of `most_columns` does not hold them.
+) -> LeadingEigenpairs | None:
+    """Return the leading eigenvectors of C (D, D); None if a basis of `most_columns` is too small for them.
 
     Args:
-        apply: Q (D, b) -> C Q; C is symmetric and positive.
+        apply: function Q (D, b) -> C Q; C is symmetric and positive.
         size: D.
-        modes: how many; a float for as many as hold that share of `total`.
+        modes: number of eigenvectors; a float for the number with that share of `total`.
         total: trace of C.
-        block: columns of a product.
-        most_columns: of the basis.
-        stop: when to.
-        seed: of the first block.
-        passes: the folder of this matrix, these modes and this seed alone where each pass is kept, so that a run that
-            is killed goes on with the pass it was in; None keeps nothing.
-        on_pass: called with the number of a pass and the largest residual after it as a share of the first eigenvalue.
+        block: number of columns of a product.
+        most_columns: maximum number of columns of the basis.
+        stop: stopping rule.
+        seed: seed of the first block.
+        passes: folder, used for this matrix, these modes and this seed only, where each pass is kept, so that a run
+            that was killed continues with its last pass; None keeps nothing.
+        on_pass: function called with the number of a pass and the largest residual after it as a share of the first
+            eigenvalue.
     """
     Q = np.linalg.qr(np.random.default_rng(seed).standard_normal((size, min(block, size))))[0]
     basis: list[FloatArray] = []
@@ -94,10 +95,10 @@ def leading(
         kept = None if file is None else kept_arrays(file)
         if kept is None:
             W = apply(Q)
-            products = _taken_off(W, basis)
-            products += _taken_off(W, basis)
+            products = _remove_basis(W, basis)
+            products += _remove_basis(W, basis)
             least = _DEPENDENT * float(np.abs(T).max(initial=np.abs(products).max()))
-            Q, beyond = _orthonormal(W, basis, least)
+            Q, beyond = _orthonormalise(W, basis, least)
             if file is not None:
                 write_arrays(file, {"block": Q, "products": products, "beyond": beyond})
         else:
@@ -107,7 +108,7 @@ def leading(
         T = np.block([[T, products[:m]], [products[:m].T, own]])
         full, exhausted = len(T) + Q.shape[1] > most_columns, not Q.shape[1]
         values, S = largest_eigenpairs(T)
-        count = _wanted(values, modes, total)
+        count = _count_wanted(values, modes, total)
         if count is not None or exhausted:
             count = count or len(T)
             residuals = np.linalg.norm(beyond @ S[len(S) - beyond.shape[1] :, :count], axis=0)
@@ -115,7 +116,7 @@ def leading(
                 on_pass(step, float(residuals.max() / values[0]))
             reached = stop.reached(np.append(values, 0.0)[: count + 1], residuals)
             if exhausted or reached or (full and residuals.max() <= stop.enough * values[0]):
-                ritz = _refined(apply, basis, S[:, :count])
+                ritz = _solve_in_span(apply, basis, S[:, :count])
                 if exhausted or ritz.residuals.max() <= stop.enough * ritz.values[0]:
                     return ritz
         if full:
@@ -128,11 +129,11 @@ def largest_eigenpairs(
     """Return the `count` largest eigenvalues of a symmetric matrix, falling, and their vectors as columns.
 
     Args:
-        matrix: (N, N), of which the lower triangle is read.
+        matrix: (N, N) symmetric matrix; only the lower triangle is read.
         count: K; None, or more than N, for all.
-        overwrite: whether the matrix may be destroyed, which saves its memory.
+        overwrite: whether the matrix may be overwritten, which saves its memory.
     """
-    from scipy.linalg import eigh  # takes a moment, which whoever only reads models need not wait for
+    from scipy.linalg import eigh  # slow to import, and readers of models do not need it
 
     n = len(matrix)
     wanted = (max(n - (count or n), 0), n - 1)
@@ -140,36 +141,38 @@ def largest_eigenpairs(
     return np.asarray(values[::-1], dtype=np.float64), np.asarray(vectors[:, ::-1], dtype=np.float64)
 
 
-def _wanted(values: FloatArray, modes: int | float, total: float) -> int | None:
-    """Return how many modes to look for, or None where the basis is yet too small for them and one more."""
+def _count_wanted(values: FloatArray, modes: int | float, total: float) -> int | None:
+    """Return the number of modes to compute, or None if the basis is too small for them and one more."""
     if isinstance(modes, int):
         return modes if len(values) > modes else None
     held = np.cumsum(values) >= modes * total
     return int(held.argmax()) + 1 if held[:-1].any() else None
 
 
-def _taken_off(W: FloatArray, basis: list[FloatArray]) -> FloatArray:
-    """Take the part of `W` (D, b) along the basis off it, and return its products with it (m, b)."""
+def _remove_basis(W: FloatArray, basis: list[FloatArray]) -> FloatArray:
+    """Subtract from `W` (D, b) its part along the basis, in place, and return its products with the basis (m, b)."""
     products = [Q.T @ W for Q in basis]
     for Q, product in zip(basis, products, strict=True):
         W -= Q @ product
     return np.vstack(products)
 
 
-def _orthonormal(W: FloatArray, basis: list[FloatArray], least: float) -> tuple[FloatArray, FloatArray]:
-    """Return Q (D, b') and B (b', b) so that W is Q B but for what is shorter than `least`, Q orthogonal to `basis`."""
+def _orthonormalise(W: FloatArray, basis: list[FloatArray], least: float) -> tuple[FloatArray, FloatArray]:
+    """Return Q (D, b'), orthogonal to `basis`, and B (b', b), so that W is Q B up to directions below `least`."""
     Q, R = np.linalg.qr(W)
     U, lengths, Vt = np.linalg.svd(R)
     there = lengths > least
     Q = Q @ U[:, there]
-    # Short directions were blown up together with the rounding along the basis.
-    _taken_off(Q, basis)
+    # Normalising short directions amplified the rounding along the basis.
+    _remove_basis(Q, basis)
     Q, R = np.linalg.qr(Q)
     return Q, R @ (lengths[there, None] * Vt[there])
 
 
-def _refined(apply: Callable[[FloatArray], FloatArray], basis: list[FloatArray], S: FloatArray) -> Leading:
-    """Return the eigenvectors within the span of the sums `S` (m, K) of the basis, and what a product says of them."""
+def _solve_in_span(
+    apply: Callable[[FloatArray], FloatArray], basis: list[FloatArray], S: FloatArray
+) -> LeadingEigenpairs:
+    """Return the eigenvectors within the span of the sums `S` (m, K) of the basis, with residuals from a product."""
     V, column = np.zeros((len(basis[0]), S.shape[1])), 0
     for Q in basis:
         V += Q @ S[column : column + Q.shape[1]]
@@ -178,4 +181,4 @@ def _refined(apply: Callable[[FloatArray], FloatArray], basis: list[FloatArray],
     small = V.T @ CV
     values, R = largest_eigenpairs((small + small.T) / 2)
     V, CV = V @ R, CV @ R
-    return Leading(values, V, np.linalg.norm(CV - V * values, axis=0))
+    return LeadingEigenpairs(values, V, np.linalg.norm(CV - V * values, axis=0))

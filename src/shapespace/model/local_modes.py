@@ -1,7 +1,7 @@
-"""Smooth local versions of a model's modes: a prior for what a new shape has outside the span of a few.
+"""Smooth local versions of a model's modes: a prior for the part of a new shape outside the span of a few shapes.
 
-What modes leave varies as they do, only locally, so their covariance damped with distance predicts it (Wilms, Handels
-and Ehrhardt, Medical Image Analysis 38, 2017). Its total variance is measured on shapes left out.
+The part outside varies as the modes do, only locally, so their covariance damped with distance predicts it (Wilms,
+Handels and Ehrhardt, Medical Image Analysis 38, 2017). Its total variance is measured on held-out shapes.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ _CENTRES = 40  # centres of the smooth fields, spread evenly over the mean
 _FIELD_SHARE = 0.999  # share of the variance of the smooth fields that their leading ones must have
 MOST_PRODUCTS = 600  # products of modes and fields, the columns of the decomposition; time grows with the square
 _BLOCK = 250
-"""Vertices: the products of all at once are many times as large as the model."""
+"""Number of vertices of a block: the products of all at once are many times as large as the model."""
 _RANGE_SHARE = 0.6  # share of the model's size; range of the smooth fields
 _FAINT = 1e-7
-"""Of the variance of the modes; local modes with less are not worth their time."""
+"""Share of the variance of the modes below which local modes are omitted, to save time."""
 _ROOM = 4
-"""Local modes are at most one in so many of the coordinates, so that they cannot make everything."""
+"""Smallest ratio of the number of coordinates to local modes, so that these cannot represent every shape."""
 
 
 def local_modes(
@@ -30,11 +30,11 @@ def local_modes(
     """Return local modes (3V, R), orthonormal and orthogonal to `modes`, and their variances (R,), mm^2.
 
     Args:
-        mean: (V, 3) mm.
-        modes: (3V, K), orthonormal.
-        variance: (K,) of each, mm^2.
-        left_mm2: what new shapes have outside `modes`; all local modes together have as much.
-        most: how many at most.
+        mean: (V, 3) vertices of the mean, mm.
+        modes: (3V, K) orthonormal modes.
+        variance: (K,) variance of each mode, mm^2.
+        left_mm2: variance of new shapes outside `modes`, mm^2, which is the sum over all local modes.
+        most: maximum number of local modes.
     """
     fields = smooth_fields(mean, _RANGE_SHARE * rms_size(mean))
     stddev = np.sqrt(variance)
@@ -59,7 +59,7 @@ def local_modes(
     significant = value * left_mm2 / total > _FAINT * variance.sum()
     mix = vector[:, significant] / np.sqrt(value[significant])
     local = np.concatenate([products(rows) @ mix for rows in blocks]) - modes @ (inside @ mix)
-    # Faint ones lose digits where most of them lies inside.
+    # Faint local modes lose precision if most of them lies inside the span of the modes.
     return np.linalg.qr(local)[0], value[significant] * left_mm2 / total
 
 
@@ -77,7 +77,7 @@ def strongest_products(stddev: FloatArray, size: FloatArray, count: int) -> tupl
 
 
 def smooth_fields(x: FloatArray, range_mm: float) -> FloatArray:
-    """Return (V, m) fields f with sum_m f_m(x) f_m(y) near exp(-|x - y|^2 / range^2), but for their mean.
+    """Return fields f (V, m) with sum_m f_m(x) f_m(y) near exp(-|x - y|^2 / range^2), without their mean.
 
     A constant field times a mode is that mode.
     """

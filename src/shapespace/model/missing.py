@@ -1,9 +1,9 @@
 """Models of shapes with missing vertices, which are not-a-number.
 
-Poses need whole shapes: what is aligned by the parts that happen to be there leans towards them. So shapes are
-completed by probabilistic PCA, aligned as whole shapes are, and completed anew, the last time with all modes that so
-many shapes determine. The modes are then those of the completed shapes, with the conditional covariance of the missing
-vertices added to their covariance, so that holes neither narrow nor bend them. Equations Cn are those of
+Alignment needs complete shapes: an alignment by the observed parts is biased towards them. So shapes are
+completed by probabilistic PCA, aligned as complete shapes are, and completed again, the last time with all modes that
+so many shapes determine. The modes are then those of the completed shapes, with the conditional covariance of the
+missing vertices added to their covariance, so that holes neither narrow nor distort them. Equations Cn are those of
 docs/missing.md.
 """
 
@@ -36,15 +36,15 @@ MIN_SEEN = 0.5
 """Share of the shapes that must observe a vertex for it to be in a model, by default."""
 _FEWEST = 2  # shapes that must observe a vertex: fewer have no variance
 _POSES_BY = (8, 60)
-"""Modes of the completions that poses are taken from, one after the other: with few only, variation that they lack
+"""Numbers of modes of the completions, in turn, on which the poses are based: with few modes only, the other variation
 becomes pose, and alignment then removes real modes."""
 _MODES_A_SHAPE, _MOST_MODES = 0.7, 60
-"""Modes that probabilistic PCA begins with; those without evidence lose their width."""
+"""Initial number of modes of probabilistic PCA, per shape and at most; modes without evidence lose their width."""
 # limit of the iterations of the mean, and the change as a share of the size that ends them
 _MEAN_ROUNDS, _STILL = 50, 1e-8
 
 
-def _observed(shapes: FloatArray) -> BoolArray:
+def _observed_mask(shapes: FloatArray) -> BoolArray:
     return ~np.logical_or.reduce(np.isnan(shapes), axis=2)
 
 
@@ -53,7 +53,7 @@ class ObservedMeshes:
     """Corresponding meshes without the vertices that few of them observe.
 
     Args:
-        meshes: N, with the observed vertices and the triangles between them.
+        meshes: N meshes, with the observed vertices and the triangles between them.
         vertices: (V,) True for each vertex that is used.
     """
 
@@ -62,39 +62,39 @@ class ObservedMeshes:
 
     @staticmethod
     def of(meshes: Sequence[Mesh], min_seen: float) -> ObservedMeshes:
-        """Return the meshes with the vertices that at least the share `min_seen` of them, and two, observe.
+        """Return the meshes with the vertices that at least the share `min_seen` of the meshes, and two, observe.
 
         Raises:
             InputError: a share outside (0, 1], a mesh with no observed vertex, or no vertex that enough meshes observe.
         """
         if not 0 < min_seen <= 1:
             raise InputError(f"The share of meshes that show a vertex lies above 0 and at most at 1, not {min_seen:g}.")
-        observed = _observed(np.stack([mesh.vertices for mesh in meshes]))
+        observed = _observed_mask(np.stack([mesh.vertices for mesh in meshes]))
         if observed.all():
             return ObservedMeshes(meshes, observed[0])
         for mesh, own in zip(meshes, observed, strict=True):
             if not own.any():
-                raise InputError(f"{mesh.name}: all of its vertices are missing; leave it out.")
+                raise InputError(f"{mesh.name}: all of its vertices are missing; exclude this mesh.")
         used = observed.sum(axis=0) >= max(min_seen * len(meshes) * (1 - 1e-12), _FEWEST)
         pairs = None if meshes[0].faces is None else pairs_of_triangles(meshes[0].faces, len(used))
         if pairs is not None:
-            used &= used[pairs]  # a symmetric template stays one
+            used &= used[pairs]  # keeps a symmetric template symmetric
         if not used.any():
             raise InputError(
-                f"No vertex is observed by {100 * min_seen:g} % of the meshes and two of them, so nothing varies that "
-                "could be learnt; give a smaller --min-seen (min_seen) or meshes with fewer missing vertices."
+                f"No vertex is observed by {100 * min_seen:g} % of the meshes and by at least two, so there is no "
+                "variation to model; give a smaller --min-seen (min_seen) or meshes with fewer missing vertices."
             )
         if used.all():
             return ObservedMeshes(meshes, used)
         return ObservedMeshes([part_of(mesh, used) for mesh in meshes], used)
 
     def regions(self, regions: Mapping[str, IntArray]) -> dict[str, IntArray]:
-        """Return the observed vertices of each region, in new numbers; regions without any are left out."""
+        """Return the observed vertices of each region, with new indices; regions without any are omitted."""
         number = np.cumsum(self.vertices, dtype=np.int32) - 1
         return {name: number[own[self.vertices[own]]] for name, own in regions.items() if self.vertices[own].any()}
 
     def landmarks(self, landmarks: Mapping[str, int]) -> SurfaceLandmarks:
-        """Return the landmarks whose vertices are all used, in their new numbers.
+        """Return the landmarks whose vertices are all used, with their new indices.
 
         Raises:
             InputError: a landmark on a vertex that the meshes do not have.
@@ -104,12 +104,12 @@ class ObservedMeshes:
         return given.renumbered(self.vertices)
 
     def notes(self, min_seen: float, landmarks: Mapping[str, int]) -> list[str]:
-        """Return which vertices, and which of the `landmarks` of the meshes, are not used since few observe them."""
+        """Return notes on the vertices and `landmarks` that are not used, since too few meshes observe them."""
         out, lost = int((~self.vertices).sum()), sorted(set(landmarks) - set(self.landmarks(landmarks)))
         number = "1 vertex is" if out == 1 else f"{out} vertices are"
         notes = [
-            f"{number} taken out of the model, since fewer than {100 * min_seen:g} % of the meshes show them; "
-            "--min-seen says how many must."
+            f"{number} removed from the model, since fewer than {100 * min_seen:g} % of the meshes show them; "
+            "--min-seen sets the required share."
         ]
         of_landmarks = (
             f"The model has no {', '.join(lost)}, since these landmarks lie in triangles with vertices that are taken "
@@ -118,7 +118,7 @@ class ObservedMeshes:
         return [*(notes if out else []), *([of_landmarks] if lost else [])]
 
     def indices(self, vertices: IntArray | None) -> IntArray | None:
-        """Return those of `vertices` that are used, in their new numbers; None stays None."""
+        """Return those of `vertices` that are used, with their new indices; None stays None."""
         if vertices is None or self.vertices.all():
             return vertices
         chosen = np.asarray(vertices)
@@ -127,7 +127,7 @@ class ObservedMeshes:
 
 
 def missing_notes(meshes: Sequence[Mesh]) -> list[str]:
-    """Return how many vertices of corresponding meshes are missing, in a sentence, if there are any."""
+    """Return the number of missing vertices of corresponding meshes, in a sentence, if any."""
     holed = [int(np.isnan(mesh.vertices).any(axis=1).sum()) for mesh in meshes]
     if not any(holed):
         return []
@@ -138,12 +138,12 @@ def missing_notes(meshes: Sequence[Mesh]) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class CompletedShapes:
-    """Aligned shapes with their missing vertices at the conditional means, and the uncertainty of these.
+    """Aligned shapes with their missing vertices at the conditional means, and the uncertainty of these vertices.
 
     Args:
-        shapes: (N, V, 3) mm.
-        observed: (N, V).
-        fitted: the probabilistic PCA that completed them.
+        shapes: (N, V, 3) aligned and completed shapes, mm.
+        observed: (N, V) True for observed vertices.
+        fitted: the probabilistic PCA that completed the shapes.
     """
 
     shapes: FloatArray
@@ -151,10 +151,10 @@ class CompletedShapes:
     fitted: Ppca
 
     def components(self, modes: Modes, seed: int) -> PrincipalComponents:
-        """Return mean and modes, as `principal_components` does of whole shapes.
+        """Return mean and modes, as `principal_components` does of complete shapes.
 
         Raises:
-            InputError: no variation.
+            InputError: the shapes have no variation.
         """
         n = len(self.shapes)
         data = self.shapes.reshape(n, -1)
@@ -174,7 +174,7 @@ class CompletedShapes:
     def _conditional_covariance(self, basis: FloatArray) -> tuple[FloatArray, float]:
         """Return the covariance (R, R) of missing vertices along `basis` (3V, R), summed over shapes, and its trace.
 
-        The trace is that over all coordinates.
+        The trace is over all coordinates.
         """
         r, k = basis.shape[1], len(self.fitted.width)
         modes = basis.reshape(-1, 3, r)
@@ -200,25 +200,27 @@ def complete(
 
     Args:
         shapes: (N, V, 3) mm, each vertex in at least one; not-a-number where missing.
-        names: of the shapes, for messages.
-        gauge: as of `align_in_place`.
-        align: False takes the shapes as they stand.
-        alignment_vertices: as of `align_in_place`.
+        names: names of the shapes, for messages.
+        gauge: whether size is kept or removed, see `align_in_place`.
+        align: whether to align the shapes; False uses their given poses.
+        alignment_vertices: vertices that determine the alignment, see `align_in_place`.
 
     Raises:
         InputError: too little of a shape is observed to align it.
     """
-    observed = _observed(shapes)
+    observed = _observed_mask(shapes)
     n = len(shapes)
     most = max(1, min(round(_MODES_A_SHAPE * n), _MOST_MODES, n - 2))
     guess = (
-        _mean_filled(shapes, observed, names, gauge) if align else _filled(shapes, observed, _mean_of(shapes, observed))
+        _fill_with_mean(shapes, observed, names, gauge)
+        if align
+        else _fill_missing(shapes, observed, _mean_of(shapes, observed))
     )
     if align:
         for modes in _POSES_BY:
             posed = align_shapes(guess.copy(), gauge, alignment_vertices)
             fitted = ppca(posed, observed, min(most, modes))
-            guess = _in_own_pose(shapes, observed, posed, fitted)
+            guess = _restore_poses(shapes, observed, posed, fitted)
         guess = align_shapes(guess.copy(), gauge, alignment_vertices)
     fitted = ppca(guess, observed, most)
     for i, hidden in enumerate(fitted.patterns.hidden):
@@ -231,8 +233,8 @@ def with_estimates(shapes: FloatArray, names: Sequence[str], gauge: Gauge = "sha
 
     Args:
         shapes: (N, V, 3) in any poses, each vertex in at least one shape; not-a-number where missing.
-        names: of the shapes, for messages.
-        gauge: as of `align_in_place`.
+        names: names of the shapes, for messages.
+        gauge: whether size is kept or removed, see `align_in_place`.
 
     Returns:
         (N, V, 3), with the vertices that are not missing unchanged.
@@ -241,13 +243,13 @@ def with_estimates(shapes: FloatArray, names: Sequence[str], gauge: Gauge = "sha
         InputError: too little of a shape is observed to align it.
     """
     completed = complete(shapes, names, gauge)
-    return _in_own_pose(shapes, completed.observed, completed.shapes, completed.fitted)
+    return _restore_poses(shapes, completed.observed, completed.shapes, completed.fitted)
 
 
-def _mean_filled(shapes: FloatArray, observed: BoolArray, names: Sequence[str], gauge: Gauge) -> FloatArray:
+def _fill_with_mean(shapes: FloatArray, observed: BoolArray, names: Sequence[str], gauge: Gauge) -> FloatArray:
     """Return the shapes, each in its own pose, with the mean at missing vertices.
 
-    The mean is that of generalised Procrustes over shared vertices, as large as the most complete shape.
+    The mean is that of generalised Procrustes over shared vertices, in the size of the most complete shape.
     """
     first = int(observed.sum(axis=1).argmax())
     mean, shared, size = shapes[first], observed & observed[first], 0.0
@@ -260,7 +262,7 @@ def _mean_filled(shapes: FloatArray, observed: BoolArray, names: Sequence[str], 
         if shared is observed and float(np.abs(mean - previous).max()) <= _STILL * size:
             break
         shared = observed
-    return _filled(shapes, observed, np.stack([T.inverse().apply(mean) for T in poses]))
+    return _fill_missing(shapes, observed, np.stack([T.inverse().apply(mean) for T in poses]))
 
 
 def _mean_of(shapes: FloatArray, observed: BoolArray) -> FloatArray:
@@ -268,12 +270,12 @@ def _mean_of(shapes: FloatArray, observed: BoolArray) -> FloatArray:
     return np.asarray(np.where(weights, shapes, 0.0).sum(axis=0) / weights.sum(axis=0), dtype=np.float64)
 
 
-def _filled(shapes: FloatArray, observed: BoolArray, by: FloatArray) -> FloatArray:
+def _fill_missing(shapes: FloatArray, observed: BoolArray, by: FloatArray) -> FloatArray:
     return np.where(observed[:, :, None], shapes, by)
 
 
-def _in_own_pose(shapes: FloatArray, observed: BoolArray, posed: FloatArray, fitted: Ppca) -> FloatArray:
-    """Return the shapes in the poses and sizes that they came in, completed by the estimates in the common one."""
+def _restore_poses(shapes: FloatArray, observed: BoolArray, posed: FloatArray, fitted: Ppca) -> FloatArray:
+    """Return the shapes in their given poses and sizes, completed by the estimates in the common pose."""
     out = shapes.copy()
     for i, hidden in enumerate(fitted.patterns.hidden):
         if len(hidden):
@@ -288,11 +290,11 @@ def pose_on_shared(
     """Return the pose of a shape (V, 3) on a mean by their `shared` vertices (V,), with scale unless the gauge is form.
 
     Raises:
-        InputError: they are too few.
+        InputError: too few vertices are shared.
     """
     try:
         return fit_similarity(shape[shared], mean[shared], with_scale=gauge == "shape")
     except InputError as error:
         raise InputError(
-            f"{name}: too little of it is there to be aligned with the other meshes; leave it out."
+            f"{name}: too few of its vertices are observed to align it with the other meshes; exclude this mesh."
         ) from error

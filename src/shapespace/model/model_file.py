@@ -1,4 +1,4 @@
-"""The model file: one HDF5 file with everything that the model is.
+"""The model file: one HDF5 file with all data of a model.
 
 Landmarks are stored as triangles and barycentric coordinates.
 """
@@ -35,7 +35,7 @@ _EVERY_MODEL = (
     "mean", "basis", "stddev", "faces", _RESIDUALS, _REGIONS, _CORNERS, _BARYCENTRIC, _DISTANCE, _TRAINING,
     _TRAINING_REST, _TRAINING_SIZE, _DROPPED,
 )  # fmt: skip
-"""What is not of one representation."""
+"""Arrays and attributes that do not depend on the representation."""
 _LONGEST_DETAIL = 200  # characters of a library's error that a message repeats
 _WHOLE_NUMBERS = ("faces", "control_counts", "degree", _REGIONS, _CORNERS, _DROPPED)
 
@@ -61,7 +61,7 @@ ModelFields: TypeAlias = dict[str, Any]
 
 
 def hash_of(model: ModelFields) -> str:
-    """Return the SHA-256 of everything that `model` is, whatever file it stands in."""
+    """Return the SHA-256 of all data of `model`, independent of its file."""
     return content_hash(*_contents(model))
 
 
@@ -71,7 +71,7 @@ def save(
     more_arrays: Mapping[str, npt.NDArray[Any]] | None = None,
     more_attributes: Mapping[str, Attribute] | None = None,
 ) -> None:
-    """Write `model`, and what a larger model adds to it, to `path`, whole or not at all."""
+    """Write `model`, and the additional data of a larger model, to `path`, completely or not at all."""
     arrays, attributes = _contents(model)
     made_by: dict[str, Attribute] = {"model_hash": hash_of(model), "software_version": __version__}
     made_by["n_training_known"] = "yes" if model["is_n_training_known"] else "no"
@@ -86,7 +86,7 @@ def save(
 
 
 def _contents(model: ModelFields) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Attribute]]:
-    """Return the arrays and attributes that make up `model`; the software version is not part of them."""
+    """Return the arrays and attributes that define `model`; the software version is not among them."""
     arrays: dict[str, npt.NDArray[Any]] = {name: model[name] for name in ("mean", "basis", "stddev")}
     if model["faces"] is not None:
         arrays["faces"] = model["faces"]
@@ -109,15 +109,15 @@ def _contents(model: ModelFields) -> tuple[dict[str, npt.NDArray[Any]], dict[str
         "provenance": model["provenance"],
         "licence": model["licence"],
     }
-    # Only where there are some, so that models without any keep their hash.
+    # Only if there are any, so that models without them keep their hash.
     if regions := model["regions"]:
         arrays[_REGIONS] = np.concatenate(list(regions.values()))
         attributes[_REGIONS] = json.dumps({name: len(vertices) for name, vertices in regions.items()})
     return arrays, attributes
 
 
-def _regions(text: str, vertices: IntArray | None) -> dict[str, IntArray]:
-    """Return name -> vertices, of what the attribute tells of how many each has, and the array of all of them."""
+def _read_regions(text: str, vertices: IntArray | None) -> dict[str, IntArray]:
+    """Return name -> vertices, from the JSON `text` with the size of each region, and all vertices in one array."""
     counts = msgspec.convert(plain_json(text), dict[str, int])
     ends = np.cumsum(list(counts.values()), dtype=np.int64)
     if any(count < 1 for count in counts.values()) or sum(counts.values()) != (
@@ -138,8 +138,8 @@ def load(path: Path) -> ModelFields:
     """Return the fields of the `ShapeModel` in `path`.
 
     Raises:
-        FileError: it cannot be read.
-        ModelFileError: it is damaged, of another version, or not a model.
+        FileError: the file cannot be read.
+        ModelFileError: the file is damaged, of another version, or not a model.
     """
     try:
         arrays, attributes = read_hdf5(path)
@@ -164,7 +164,7 @@ def load(path: Path) -> ModelFields:
                 length = np.einsum("dk,dk->k", arrays["basis"], arrays["basis"])
             if not (np.abs(length - 1.0) < UNIT_TOLERANCE).all():
                 raise ValueError("a column of basis is not of length 1")
-        # What was read is a view of the whole file, which is let go here.
+        # The arrays are views of the complete file, whose memory the copies release.
         owned = {name: array.copy() for name, array in arrays.items()}
         places = (owned[name] for name in (_CORNERS, _BARYCENTRIC, _DISTANCE)) if vertices else ()
         landmarks = SurfaceLandmarks(tuple(vertices), *places)
@@ -185,7 +185,7 @@ def load(path: Path) -> ModelFields:
             "licence": attributes_of_file.licence,
             "held_out": attributes_of_file.variance_divisor == _HELD_OUT,
             "residuals": owned.get(_RESIDUALS),
-            "regions": _regions(attributes_of_file.regions, owned.get(_REGIONS)),
+            "regions": _read_regions(attributes_of_file.regions, owned.get(_REGIONS)),
             "is_n_training_known": attributes_of_file.n_training_known != "no",
             "training": _training_shapes(owned),
             "dropped_vertices": owned.get(_DROPPED, np.zeros(0, dtype=np.int32)),

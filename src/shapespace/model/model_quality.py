@@ -1,13 +1,13 @@
-"""How good a shape space is: compactness, generalisation and specificity over the number of modes, with intervals.
+"""Quality of a shape model: compactness, generalisation and specificity over the number of modes, with intervals.
 
-Compactness is the share of the variance that the first modes hold. Generalisation is the error on shapes that the model
-did not see: in each fold poses, mean and modes are found anew without them, and each is reconstructed from the first
-modes in its best pose. Specificity is the distance of random shapes of the model from the nearest training shape.
-Davies, Twining, Cootes, Waterton and Taylor, TMI 21(5), 2002; Styner et al., IPMI 2003. Distances are given twice and
-never mixed: `vertices`, from each vertex to the one that corresponds, and `surface`, from vertices to the nearest point
-of the other surface, the mean of both directions: the first flatters shapes whose vertices slid (Ericsson and Karlsson,
-2007), the second does not see it at all. `floor_mm` is the error that a model leaves where every correspondence is
-known: what no fit can do better than.
+Compactness is the share of the variance of the first modes. Generalisation is the error on shapes that the model
+did not see: in each fold poses, mean and modes are computed without the held-out shapes, and each of these is
+reconstructed from the first modes in its best pose. Specificity is the distance of random shapes of the model from the
+nearest training shape. Davies, Twining, Cootes, Waterton and Taylor, TMI 21(5), 2002; Styner et al., IPMI 2003.
+Distances are computed in two ways and never mixed: `vertices`, from each vertex to its corresponding vertex, and
+`surface`, from vertices to the nearest point of the other surface, the mean of both directions: the first is too small
+for shapes whose vertices slid (Ericsson and Karlsson, 2007), the second does not detect sliding at all. `floor_mm` is
+the error of a model if every correspondence is known: the lower bound for every fit.
 """
 
 from __future__ import annotations
@@ -39,28 +39,28 @@ from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity, 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_FEWEST = 3  # shapes; without one of them two are left, and fewer have no mode
+_FEWEST = 3  # shapes; without one of these two are left, and fewer have no mode
 _MOST_COUNTS, _MOST_SPECIFIC = 12, 6
-"""Numbers of modes that are tried; specificity takes longest."""
+"""Largest number of compared numbers of modes, and the same for the specificity, which takes longest."""
 _POINTS = 1000
-"""Vertices that distances between surfaces are measured at, spread evenly over their numbers."""
+"""Largest number of vertices at which distances between surfaces are measured, spread evenly over their indices."""
 _POSE_ROUNDS = 3  # alternations of pose and coefficients
 _NEAREST = 2
-"""Training shapes nearest by vertices, of which the nearest by surface is taken."""
+"""Number of training shapes nearest by vertices that are compared by surface."""
 _RESAMPLES = 2000  # bootstrap samples, enough for percentiles 2.5 and 97.5
 _PARTS = (0.25, 0.5, 0.75, 1.0)  # shares of the training shapes at which the learning curve is measured
 _ANY = 1e-9
-"""Share of the shapes that show a vertex: two of them are enough for a model that is measured."""
+"""Share of the meshes that show a vertex of a measured model; with it, two meshes are enough."""
 _LEAST_NOISE = 1e-6
-"""Share of the variance that is noise where the modes hold all of it."""
+"""Share of the variance that counts as noise if the modes contain the complete variance."""
 _DRAWN_AT_ONCE = 5
-"""Random shapes of one part of the work."""
+"""Number of random shapes of one part of the work."""
 _FAR = 0.05
-"""Of the size of a surface: what lies farther from its scan is no surface of it."""
+"""Median distance of a surface from its scan, as a share of its size, above which the two do not belong together."""
 
 
 OnStep: TypeAlias = Callable[[int, int], None]
-"""Called with what is done and what there is to do."""
+"""Function that is called with the number of finished steps and the number of all steps."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,9 +70,9 @@ class Curve:
     Args:
         counts: (n,) numbers of modes or shapes.
         mean: (n,) mm, or a share.
-        low: (n,) where its 95 % interval begins.
-        high: (n,) where it ends.
-        each: (S, n) of each shape or sample, where the mean is over them.
+        low: (n,) lower ends of the 95 % intervals.
+        high: (n,) upper ends of the intervals.
+        each: (S, n) values of each shape or sample, if the mean is over them.
 
     Example:
         >>> quality = ss.model.measure_quality(meshes, config=ss.model.QualityConfig(folds=2, samples=2))
@@ -99,24 +99,24 @@ class Curve:
 
 @dataclass(frozen=True, eq=False)
 class ModelQuality:
-    """Quality measures of a shape space; None where the shapes or the model do not determine one.
+    """Quality measures of a shape model; None if the shapes or the model do not determine a measure.
 
     Args:
         compactness: shares of the variance; the interval is by jackknife over shapes, none for a model alone.
-        generalisation: mm, surface to surface, over shapes left out.
-        generalisation_vertices: the same, vertex to vertex.
-        specificity: mm, surface to surface, over random shapes.
-        specificity_vertices: the same, vertex to vertex.
-        reconstruction: mm, surface to surface, over unseen shapes that were given.
-        reconstruction_vertices: the same, vertex to vertex.
+        generalisation: errors of held-out shapes, mm, surface to surface.
+        generalisation_vertices: errors of held-out shapes, mm, vertex to vertex.
+        specificity: distances of random shapes, mm, surface to surface.
+        specificity_vertices: distances of random shapes, mm, vertex to vertex.
+        reconstruction: errors of the given unseen shapes, mm, surface to surface.
+        reconstruction_vertices: errors of the given unseen shapes, mm, vertex to vertex.
         by_shapes: generalisation (vertices) with all modes by the number of training shapes.
-        supported_modes: the number that `build --modes auto` keeps.
-        shapes: how many there were.
-        folds: in how many parts they were left out.
-        points: at how many vertices distances between surfaces were measured.
-        seed: of all that is drawn.
-        missing_share: of the vertices, over all shapes; nothing is measured there.
-        left_out_vertices: that less than half of the shapes show, so that nothing is measured of them at all.
+        supported_modes: number of modes that `build --modes auto` keeps.
+        shapes: number of shapes.
+        folds: number of folds of the cross-validation.
+        points: number of vertices at which distances between surfaces were measured.
+        seed: seed of all random choices.
+        missing_share: share of the vertices, over all shapes, that are missing and were not measured.
+        left_out_vertices: number of vertices that less than half of the shapes show, so that they were not measured.
 
     Example:
         >>> quality = ss.model.measure_quality(meshes, config=ss.model.QualityConfig(folds=2, samples=2))
@@ -147,10 +147,10 @@ class ModelQuality:
         return f"<ModelQuality of {self.shapes} shapes: {', '.join(parts)}>"
 
     def plot(self, **options: Any) -> Figure:
-        """Return a matplotlib figure of all measures that there are, over the number of modes.
+        """Return a matplotlib figure of all available measures over the number of modes.
 
         Args:
-            options: of `shapespace.report.figures.quality_figure`.
+            options: options of `shapespace.report.figures.quality_figure`.
 
         Raises:
             ShapespaceError: the extra `report` is not installed.
@@ -161,7 +161,7 @@ class ModelQuality:
         return lazy_import("html_of_quality")(self)
 
     def sentences(self) -> tuple[str, ...]:
-        """Return how many modes the shapes support, and whether more shapes would help."""
+        """Return the number of modes that the shapes support, and whether more shapes would help."""
         sentences: list[str] = []
         if self.supported_modes is not None:
             modes = "1 mode" if self.supported_modes == 1 else f"{self.supported_modes} modes"
@@ -174,15 +174,15 @@ class ModelQuality:
         return tuple(sentences)
 
     def differences(self, other: ModelQuality) -> dict[str, Curve]:
-        """Return what `other` has less what this has, shape by shape, by the names of the measures.
+        """Return the values of `other` minus those of this measurement, shape by shape, by the names of the measures.
 
         Raises:
-            InputError: they are not of the same shapes in the same folds.
+            InputError: the measurements are not of the same shapes in the same folds.
         """
         same_shapes = self.shapes and other.shapes
         if same_shapes and (self.shapes, self.folds, self.seed) != (other.shapes, other.folds, other.seed):
             raise InputError(
-                f"Only what was measured on the same shapes in the same folds can be compared, not {self.shapes} "
+                f"Only measurements of the same shapes in the same folds can be compared, not {self.shapes} "
                 f"shapes in {self.folds} folds with {other.shapes} in {other.folds}."
             )
         out: dict[str, Curve] = {}
@@ -197,21 +197,21 @@ class ModelQuality:
 
 @dataclass(frozen=True, kw_only=True)
 class QualityConfig:
-    """How quality is measured.
+    """Settings of a quality measurement.
 
     Args:
-        folds: number of folds of the cross-validation, at most one per shape; `loo` (in Python None) leaves out one
-            shape at a time.
+        folds: number of folds of the cross-validation, at most one per shape; with `loo` (in Python None) one shape
+            is held out at a time.
         modes: largest number of modes (default: all that the folds allow).
         samples: number of random shapes for the specificity.
         seed: seed of folds and random shapes.
-        gauge: `form` keeps size, `shape` divides size out.
+        gauge: `form` keeps size, `shape` removes size.
         align: whether to align the shapes.
-        representation: as of `ShapeModel.fit`.
+        representation: representation of the shapes, see `ShapeModel.fit`.
         control_points: control points of a B-spline along each side, 4 to 64 (default 24x24).
 
     Raises:
-        InputError: numbers that cannot be.
+        InputError: a number has an impossible value.
     """
 
     folds: int | None = 10
@@ -226,12 +226,12 @@ class QualityConfig:
     def __post_init__(self) -> None:
         require_whole(self.folds, "folds")
         if self.folds is not None and self.folds < 2:
-            raise InputError(f"Shapes are left out in at least two folds, not in {self.folds}.")
+            raise InputError(f"Shapes are held out in at least two folds, not in {self.folds}.")
         if self.samples < 2 or (self.modes is not None and self.modes < 1):
             raise InputError("Quality needs at least two samples, and at least one mode.")
 
     def space(self, meshes: Sequence[Mesh], modes: Modes = "all") -> ShapeModel:
-        """Return the shape space of `meshes`, of the vertices that at least two of them show."""
+        """Return the shape model of `meshes`, with the vertices that at least two of the meshes show."""
         return ShapeModel.fit(
             meshes, modes=modes, gauge=self.gauge, align=self.align, representation=self.representation,
             control_points=self.control_points, min_seen=_ANY, seed=self.seed,
@@ -240,14 +240,14 @@ class QualityConfig:
 
 @dataclass(frozen=True, eq=False)
 class _Target:
-    """A shape in correspondence, and the surface that it is judged against: its own, or the scan it was made from.
+    """A shape in correspondence, and its reference surface: its own, or the scan that it was made from.
 
     Args:
-        shape: with not-a-number where vertices are missing.
-        seen: the numbers of the vertices that are there.
-        surface: what of the shape is there, or its scan.
-        engine: of the surface.
-        is_scan: whether that is a scan, which may show more than the shape covers.
+        shape: mesh with not-a-number at missing vertices.
+        seen: indices of the observed vertices.
+        surface: observed part of the shape, or its scan.
+        engine: search structure of the surface.
+        is_scan: whether the surface is a scan, which may show more than the shape covers.
     """
 
     shape: Mesh
@@ -263,16 +263,16 @@ class _Target:
         engine = build_engine(surface)
         if scan is not None:
             there = shape.vertices[seen]
-            far = float(np.median(engine.query(there[_spread(len(there))]).distance))
+            far = float(np.median(engine.query(there[_spread_indices(len(there))]).distance))
             if far > _FAR * float(np.linalg.norm(np.ptp(there, axis=0))):
                 raise InputError(
-                    f"{shape.name} lies {far:.1f} mm from its scan {scan.name}, so it is no surface of it; give the "
-                    "scans in the pose and unit of the surfaces."
+                    f"{shape.name} lies {far:.1f} mm from its scan {scan.name}, so they do not belong together; give "
+                    "the scans in the pose and unit of the surfaces."
                 )
         return _Target(shape, seen, surface, engine, scan is not None)
 
     def cut_to(self, space: ShapeModel) -> _Target:
-        """Return the same with those vertices only that the training shapes of `space` show."""
+        """Return the target with only those vertices that the training shapes of `space` show."""
         if len(self.shape.vertices) == space.n_vertices:
             return self
         used = ~np.isin(np.arange(len(self.shape.vertices)), space.dropped_vertices)
@@ -285,7 +285,7 @@ class _Target:
 
 
 def _observed_part(shape: Mesh, seen: IntArray) -> Mesh:
-    """Return what of a shape is there."""
+    """Return the observed part of a shape."""
     if len(seen) == len(shape.vertices):
         return shape
     used = np.zeros(len(shape.vertices), dtype=np.bool_)
@@ -295,12 +295,12 @@ def _observed_part(shape: Mesh, seen: IntArray) -> Mesh:
 
 @dataclass(frozen=True)
 class Part:
-    """A part of a measurement that needs no other: a fold, or some random shapes.
+    """An independent part of a measurement: a fold, or some random shapes.
 
     Args:
-        held: numbers of the shapes that are left out.
-        order: of all others, of which the first ones make the smaller models.
-        drawn: numbers of the random shapes.
+        held: indices of the held-out shapes.
+        order: indices of all other shapes, of which the first ones make the smaller models.
+        drawn: indices of the random shapes.
     """
 
     held: tuple[int, ...] = ()
@@ -310,12 +310,12 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Shapes:
-    """What all parts of a measurement share.
+    """Input and shared results of all parts of a measurement.
 
     Args:
-        meshes: at least three, in correspondence.
-        scans: one a mesh, or None for the meshes themselves.
-        config: of the measurement.
+        meshes: three or more meshes in correspondence.
+        scans: one scan per mesh, or None for the meshes themselves.
+        config: settings of the measurement.
     """
 
     meshes: Sequence[Mesh]
@@ -324,18 +324,18 @@ class Shapes:
 
     @cached_property
     def folds(self) -> list[IntArray]:
-        """Numbers of the shapes in each fold."""
-        return _folds(len(self.meshes), self.config)
+        """Indices of the shapes in each fold."""
+        return _split_folds(len(self.meshes), self.config)
 
     @cached_property
     def counts(self) -> IntArray:
-        """Numbers of modes that are tried."""
+        """Numbers of modes that are compared."""
         most = len(self.meshes) - max(len(fold) for fold in self.folds) - 1
-        return _counts(min(self.config.modes or most, most))
+        return _choose_counts(min(self.config.modes or most, most))
 
     @cached_property
     def few_counts(self) -> IntArray:
-        """Those for the specificity."""
+        """Numbers of modes for the specificity."""
         counts = self.counts
         picked = np.linspace(0, len(counts) - 1, min(len(counts), _MOST_SPECIFIC))
         return counts[np.unique(picked.round().astype(int))]
@@ -348,17 +348,17 @@ class Shapes:
 
     @cached_property
     def space(self) -> ShapeModel:
-        """The shape space of all."""
+        """Shape model of all meshes."""
         return self.config.space(self.meshes)
 
     @cached_property
     def targets(self) -> list[_Target]:
-        """What each shape is judged against."""
+        """Target of each shape."""
         return [_Target.of(mesh, None if self.scans is None else self.scans[i]) for i, mesh in enumerate(self.meshes)]
 
     @cached_property
     def trained(self) -> list[_Target]:
-        """The same of the vertices that the shape space has."""
+        """Target of each shape, with the vertices of the shape model."""
         return [target.cut_to(self.space) for target in self.targets]
 
     @cached_property
@@ -368,8 +368,8 @@ class Shapes:
 
     @cached_property
     def nearest(self) -> _Nearest:
-        """The training shapes in the pose of the model."""
-        return _Nearest.of(_posed(self.space, self.trained, self.config), self.space.n_vertices)
+        """Training shapes in the pose of the model."""
+        return _Nearest.of(_pose_shapes(self.space, self.trained, self.config), self.space.n_vertices)
 
     def parts(self) -> list[Part]:
         """Return all parts of the work, in the order of the output."""
@@ -384,14 +384,14 @@ class Shapes:
         ]
 
     def do(self, part: Part) -> FloatArray:
-        """Return errors, mm: of shapes left out (H, n + m, 2), the last m of models of fewer shapes; or of random ones.
+        """Return errors, mm: of held-out shapes (H, n + m, 2), the last m for fewer training shapes; or of random ones.
 
         Raises:
-            InputError: scans that are not theirs.
+            InputError: the scans are not those of the shapes.
         """
-        return self._left_out(part) if part.held else self._drawn(part)
+        return self._measure_held_out(part) if part.held else self._measure_drawn(part)
 
-    def _left_out(self, part: Part) -> FloatArray:
+    def _measure_held_out(self, part: Part) -> FloatArray:
         held = [self.targets[i] for i in part.held]
         space = self.config.space([self.meshes[i] for i in sorted(part.order)])
         out = np.zeros((len(held), len(self.counts) + len(self.sizes), 2))
@@ -404,8 +404,8 @@ class Shapes:
                 out[row, column] = _errors_by_modes(fewer, target.cut_to(fewer), only, surface=False)[0]
         return out
 
-    def _drawn(self, part: Part) -> FloatArray:
-        """Return how far random shapes (S, n, 2), mm, lie from the nearest training shape."""
+    def _measure_drawn(self, part: Part) -> FloatArray:
+        """Return the distances (S, n, 2), mm, of random shapes from the nearest training shape."""
         model, counts = self.space, self.few_counts
         mean, modes = model.mean_vertices, np.ascontiguousarray(model.vertex_basis.T)
         out = np.zeros((len(part.drawn), len(counts), 2))
@@ -416,7 +416,7 @@ class Shapes:
 
 
 Runner: TypeAlias = Callable[[Shapes, Sequence[Part]], Iterable[tuple[Part, FloatArray]]]
-"""Does the parts of a measurement, here or elsewhere, and yields each with what came of it, in any order."""
+"""Function that does the parts of a measurement, in any process, and yields each with its errors, in any order."""
 
 
 def run_here(shapes: Shapes, parts: Sequence[Part]) -> Iterable[tuple[Part, FloatArray]]:
@@ -433,58 +433,58 @@ def measure_quality(
     progress: OnStep | None = None,
     run: Runner = run_here,
 ) -> ModelQuality:
-    """Measure the shape space of meshes in correspondence; of a model, what its spectrum determines.
+    """Measure the quality of the shape model of corresponding meshes; for a model, the measures from its spectrum.
 
     Args:
-        target: at least three meshes, mm, or whatever else `as_mesh` takes; or a model, of which only compactness and
-            the measures on `unseen` are available, since a model does not keep its training shapes.
-        config: folds, modes, samples, seed, and what model to make; None for the usual ones.
-        scans: one a mesh, in its pose and unit, to judge surfaces against; None for the meshes themselves.
-        unseen: meshes in correspondence that no model saw.
-        progress: called with (steps done, in all).
-        run: does folds and random shapes, here or elsewhere.
+        target: three or more meshes, mm, or other inputs of `as_mesh`; or a model, of which only compactness and
+            the measures on `unseen` are available, since not every model contains its training shapes.
+        config: folds, modes, samples, seed, and settings of the model; None for the defaults.
+        scans: one scan per mesh, in its pose and unit, as the reference of surfaces; None for the meshes themselves.
+        unseen: meshes in correspondence that no model was trained on.
+        progress: function called with (finished steps, all steps).
+        run: function that does folds and random shapes, in this process or in others.
 
     Raises:
         CorrespondenceError: meshes differ in vertices or triangles.
-        InputError: too few meshes, all equal, coordinates that are infinite, or scans that are not theirs.
+        InputError: too few meshes, all equal, coordinates that are infinite, or scans of other shapes.
     """
     config = config or QualityConfig()
     meshes: Sequence[Mesh] = []
     if not isinstance(target, ShapeModel):
-        meshes = _checked([without_estimates(mesh) for mesh in as_meshes(target, "measure_quality")])
+        meshes = _check_meshes([without_estimates(mesh) for mesh in as_meshes(target, "measure_quality")])
     scans = None if scans is None else as_meshes(scans, "measure_quality")
     new: list[Mesh] = [without_estimates(mesh) for mesh in as_meshes(unseen, "measure_quality")]
     vertices = target.n_vertices if isinstance(target, ShapeModel) else len(meshes[0].vertices)
     if scans is not None and len(scans) != len(meshes):
-        raise InputError(f"There must be one scan a mesh, but there are {len(scans)} scans of {len(meshes)} meshes.")
+        raise InputError(f"There must be one scan per mesh, but there are {len(scans)} scans of {len(meshes)} meshes.")
     for mesh in new:
-        _refuse_other(mesh, vertices)
+        _check_vertex_count(mesh, vertices)
     if isinstance(target, ShapeModel):
-        return _of_model(target, new, config, progress)
+        return _measure_model(target, new, config, progress)
     takes_holes = representation_named(config.representation, config.control_points).takes_holes
     included = np.ones(vertices, dtype=np.bool_) if takes_holes else ObservedMeshes.of(meshes, MIN_SEEN).vertices
     if not included.all():
         meshes, new = [part_of(mesh, included) for mesh in meshes], [part_of(mesh, included) for mesh in new]
     shapes = Shapes(meshes, scans, config)
-    return _of_meshes(shapes, new, progress, run, left_out=int((~included).sum()))
+    return _measure_meshes(shapes, new, progress, run, left_out=int((~included).sum()))
 
 
-def _of_model(
+def _measure_model(
     model: ShapeModel, unseen: Sequence[Mesh], config: QualityConfig, progress: OnStep | None
 ) -> ModelQuality:
-    counts = _counts(min(config.modes or model.n_modes, model.n_modes))
+    counts = _choose_counts(min(config.modes or model.n_modes, model.n_modes))
     share = model.cumulative_variance[counts - 1]
-    of_unseen = _unseen(model, unseen, counts, config, StepCounter(len(unseen), progress))
+    of_unseen = _measure_unseen(model, unseen, counts, config, StepCounter(len(unseen), progress))
     return ModelQuality(
         Curve(counts, share, share, share),
         reconstruction=of_unseen[0],
         reconstruction_vertices=of_unseen[1],
-        points=_points(model.n_vertices),
+        points=_count_points(model.n_vertices),
         seed=config.seed,
     )
 
 
-def _of_meshes(
+def _measure_meshes(
     shapes: Shapes, unseen: Sequence[Mesh], progress: OnStep | None, run: Runner, *, left_out: int
 ) -> ModelQuality:
     meshes, config, counts, few = shapes.meshes, shapes.config, shapes.counts, shapes.few_counts
@@ -497,7 +497,7 @@ def _of_meshes(
     general = _curves(errors[:, : len(counts)], counts, config.seed)
     specific = _curves(drawn, few, config.seed)
     space = shapes.space
-    of_unseen = _unseen(space, unseen, counts, config, steps)
+    of_unseen = _measure_unseen(space, unseen, counts, config, steps)
     there = np.mean([len(target.seen) for target in shapes.targets]) / len(meshes[0].vertices)
     return ModelQuality(
         _compactness(space, shapes.trained, counts, config),
@@ -511,30 +511,30 @@ def _of_meshes(
         supported_modes=config.space(meshes, "auto").n_modes if len(meshes) >= FEWEST_SHAPES else None,
         shapes=len(meshes),
         folds=len(shapes.folds),
-        points=_points(space.n_vertices),
+        points=_count_points(space.n_vertices),
         seed=config.seed,
         missing_share=1.0 - float(there),
         left_out_vertices=left_out,
     )
 
 
-def _checked(meshes: list[Mesh]) -> list[Mesh]:
+def _check_meshes(meshes: list[Mesh]) -> list[Mesh]:
     if len(meshes) < _FEWEST:
         raise InputError(
-            f"Quality is measured on shapes left out, which takes at least three meshes, not {len(meshes)}."
+            f"Quality is measured on held-out shapes, which takes at least three meshes, not {len(meshes)}."
         )
     common_faces(meshes)
     for mesh in meshes:
         if np.isinf(mesh.vertices).any():
-            raise InputError(f"{mesh.name}: it has vertices that are infinite; mark them as missing, or leave it out.")
+            raise InputError(f"{mesh.name}: it has vertices that are infinite; mark them as missing, or exclude it.")
     return meshes
 
 
-def _refuse_other(mesh: Mesh, vertices: int) -> None:
+def _check_vertex_count(mesh: Mesh, vertices: int) -> None:
     if len(mesh.vertices) != vertices:
         raise CorrespondenceError(
             f"{mesh.name} has {len(mesh.vertices)} vertices but the model has {vertices}; unseen shapes must be in "
-            "correspondence with it, so bring them there by shapespace fit with --dense."
+            "correspondence with it, so fit the model to them by shapespace fit with --dense."
         )
 
 
@@ -543,7 +543,7 @@ def _curves(errors: FloatArray, counts: IntArray, seed: int) -> tuple[Curve, Cur
     return Curve.over(errors[:, :, 1], counts, seed), Curve.over(errors[:, :, 0], counts, seed)
 
 
-def _unseen(
+def _measure_unseen(
     space: ShapeModel, unseen: Sequence[Mesh], counts: IntArray, config: QualityConfig, steps: StepCounter
 ) -> tuple[Curve, Curve] | tuple[None, None]:
     if not unseen:
@@ -555,28 +555,28 @@ def _unseen(
     return _curves(errors, counts, config.seed)
 
 
-def _counts(most: int) -> IntArray:
-    """Return numbers of modes from 1 to `most`, a few and closer at the start."""
+def _choose_counts(most: int) -> IntArray:
+    """Return numbers of modes from 1 to `most`, denser at the start."""
     spaced = {round(most ** (step / max(_MOST_COUNTS - 1, 1))) for step in range(_MOST_COUNTS)}
     return np.array(sorted(spaced), dtype=np.int32)
 
 
-def _folds(n: int, config: QualityConfig) -> list[IntArray]:
+def _split_folds(n: int, config: QualityConfig) -> list[IntArray]:
     folds = n if config.folds is None else min(config.folds, n)
     order = np.random.default_rng(config.seed).permutation(n).astype(np.int32)
     return [np.asarray(part, dtype=np.int32) for part in np.array_split(order, folds)]
 
 
-def _points(vertices: int) -> int:
+def _count_points(vertices: int) -> int:
     return min(vertices, _POINTS)
 
 
-def _spread(vertices: int) -> IntArray:
-    return np.unique(np.linspace(0, vertices - 1, _points(vertices)).round().astype(np.int32))
+def _spread_indices(vertices: int) -> IntArray:
+    return np.unique(np.linspace(0, vertices - 1, _count_points(vertices)).round().astype(np.int32))
 
 
 def _errors_by_modes(model: ShapeModel, target: _Target, counts: IntArray, *, surface: bool = True) -> FloatArray:
-    """Return how far (n, 2), mm, a shape lies from what the first modes tell of it: its vertices, and its surface."""
+    """Return the distances (n, 2), mm, of a shape from its reconstructions by the first modes: vertices, surface."""
     there, out = target.shape.vertices[target.seen], np.zeros((len(counts), 2))
     T_model_shape = _onto_mean(model, target)
     for column, k in enumerate(counts):
@@ -594,9 +594,9 @@ def _onto_mean(model: ShapeModel, target: _Target) -> Similarity:
 
 
 def _in_best_pose(model: ShapeModel, target: _Target, k: int, T: Similarity) -> tuple[FloatArray, Similarity]:
-    """Return the shape (V, 3) that the first `k` modes tell by what is seen, and T_model_target, from `T` on.
+    """Return the shape (V, 3) of the first `k` modes that fits the observed vertices, and T_model_target, from `T` on.
 
-    The noise of shapes of which a part is missing is the variance that these modes leave over.
+    The noise of shapes with missing parts is the variance outside these modes.
     """
     shape, seen, total = target.shape.vertices, target.seen, model.total_variance
     left = max(total - float((model.stddev[:k] ** 2).sum()), _LEAST_NOISE * total)
@@ -608,10 +608,10 @@ def _in_best_pose(model: ShapeModel, target: _Target, k: int, T: Similarity) -> 
 
 
 def _surface_distance(fitted: Mesh, target: _Target) -> float:
-    """Return the mean of both mean distances between two surfaces, mm, each at points spread over what is seen."""
-    seen = target.seen[_spread(len(target.seen))]
+    """Return the mean of both mean distances between two surfaces, mm, each at points spread over the observed part."""
+    seen = target.seen[_spread_indices(len(target.seen))]
     there = target.engine.query(fitted.vertices[seen]).distance.mean()
-    back = build_engine(fitted).query(target.surface.vertices[_spread(len(target.surface.vertices))])
+    back = build_engine(fitted).query(target.surface.vertices[_spread_indices(len(target.surface.vertices))])
     counted: BoolArray = np.ones(len(back.distance), dtype=np.bool_)
     if target.is_scan:
         # A scan may show more than the surface covers.
@@ -621,13 +621,13 @@ def _surface_distance(fitted: Mesh, target: _Target) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Nearest:
-    """Training shapes in the pose of the model, to find how far others lie from the nearest one.
+    """Training shapes in the pose of the model, to find the distance of other shapes from the nearest one.
 
     Args:
-        targets: their surfaces.
-        meshes: their vertices.
-        picked: the numbers of vertices by which they are compared.
-        vertices: (N, P, 3) of those.
+        targets: targets of the training shapes, with their surfaces.
+        meshes: training shapes.
+        picked: indices of the vertices by which shapes are compared.
+        vertices: (N, P, 3) these vertices of the training shapes.
     """
 
     targets: Sequence[_Target]
@@ -637,28 +637,28 @@ class _Nearest:
 
     @staticmethod
     def of(posed: Sequence[Mesh], vertices: int) -> _Nearest:
-        picked = _spread(vertices)
+        picked = _spread_indices(vertices)
         compared = np.stack([mesh.vertices[picked] for mesh in posed])
         return _Nearest([_Target.of(mesh, None) for mesh in posed], posed, picked, compared)
 
     def off(self, shape: FloatArray) -> tuple[float, float]:
-        """Return how far `shape` (V, 3), mm, lies from the nearest one: its vertices, and its surface."""
+        """Return the distances of `shape` (V, 3), mm, from the nearest training shape: by vertices, and by surface."""
         mean_of = np.nanmean if np.isnan(self.vertices).any() else np.mean
         off = mean_of(np.linalg.norm(self.vertices - shape[self.picked], axis=2), axis=1)
         drawn, nearest = self.meshes[0].with_vertices(shape), np.argsort(off, kind="stable")[:_NEAREST]
         return float(off.min()), min(_surface_distance(drawn, self.targets[int(i)]) for i in nearest)
 
 
-def _posed(model: ShapeModel, targets: Sequence[_Target], config: QualityConfig) -> list[Mesh]:
-    """Return the shapes in the pose and size of the model, by what is seen of them."""
+def _pose_shapes(model: ShapeModel, targets: Sequence[_Target], config: QualityConfig) -> list[Mesh]:
+    """Return the shapes in the pose and size of the model, aligned by their observed vertices."""
     if not config.align:
         return [target.shape for target in targets]
-    return [one.shape.with_vertices(_onto_mean(model, one).apply(one.shape.vertices)) for one in targets]
+    return [target.shape.with_vertices(_onto_mean(model, target).apply(target.shape.vertices)) for target in targets]
 
 
 def _compactness(model: ShapeModel, targets: Sequence[_Target], counts: IntArray, config: QualityConfig) -> Curve:
-    """Return the share of the variance that the first modes hold, its interval by jackknife over shapes."""
-    posed = [mesh.vertices for mesh in _posed(model, targets, config)]
+    """Return the share of the variance of the first modes, with an interval by jackknife over shapes."""
+    posed = [mesh.vertices for mesh in _pose_shapes(model, targets, config)]
     for i, target in enumerate(targets):
         if len(target.seen) < model.n_vertices:
             reconstructed = _in_best_pose(model, target, model.n_modes, _onto_mean(model, target))[0]
@@ -668,19 +668,19 @@ def _compactness(model: ShapeModel, targets: Sequence[_Target], counts: IntArray
     share = model.cumulative_variance[np.minimum(counts, model.n_modes) - 1]
     n, count = len(targets), min(model.vertex_basis.shape[1], model.n_modes)
     rest = [np.flatnonzero(np.arange(n) != i) for i in range(n)]
-    without = np.stack([_shares(gram[np.ix_(some, some)], counts, count) for some in rest])
+    without = np.stack([_variance_shares(gram[np.ix_(some, some)], counts, count) for some in rest])
     spread = 1.96 * np.sqrt((n - 1) / n * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
     return Curve(counts, share, np.maximum(share - spread, 0.0), np.minimum(share + spread, 1.0))
 
 
-def _shares(gram: FloatArray, counts: IntArray, count: int) -> FloatArray:
+def _variance_shares(gram: FloatArray, counts: IntArray, count: int) -> FloatArray:
     centred = gram - gram.mean(axis=0) - gram.mean(axis=1)[:, None] + gram.mean()
     values = np.maximum(np.linalg.eigvalsh(centred)[::-1], 0.0)
     return np.cumsum(values)[np.minimum(counts, min(count, len(values))) - 1] / values.sum()
 
 
 def _more_shapes(by_shapes: Curve, seed: int) -> str:
-    """Return in a sentence what more training shapes did to the error, and so would do."""
+    """Return the effect of more training shapes on the error, measured and expected, in a sentence."""
     each, counts = by_shapes.each, by_shapes.counts
     if each is None:
         return ""
@@ -704,9 +704,9 @@ _STEPS, _REACHED_MM = 20, 1e-4  # limit of Gauss-Newton steps, and the vertex mo
 
 
 def floor_mm(model: ShapeModel, truth: FloatArray) -> float:
-    """Return the mean error, mm, of the shape of `model` and the pose that come nearest to `truth` (V, 3).
+    """Return the mean error, mm, of the shape of `model` in the pose that is nearest to `truth` (V, 3).
 
-    Pose and coefficients are solved for together: in turn they crawl where modes hold pose or size.
+    Pose and coefficients are solved for together: alternating between them is slow if modes contain pose or size.
     """
     b, T = model.project(truth, align=False), Similarity.identity()
     modes = model.vertex_basis.reshape(-1, 3, model.n_modes)
@@ -717,7 +717,7 @@ def floor_mm(model: ShapeModel, truth: FloatArray) -> float:
         move = np.broadcast_to(np.eye(3), turn.shape)
         reach = T.scale * (T.rotation @ modes)
         J = np.concatenate([turn, move, arm[:, :, None], reach], axis=2).reshape(-1, 7 + model.n_modes)
-        # A touch of damping, since modes may hold all of a pose.
+        # Slight damping, since modes may contain a pose completely.
         H = J.T @ J
         H[np.diag_indices_from(H)] *= 1.0 + 1e-9
         step = np.linalg.solve(H, J.T @ (truth - shape).ravel())

@@ -2,8 +2,8 @@
 
 The (3V, 3V) covariance is never formed. The (N, N) Gram matrix of the centred shapes has the same non-zero eigenvalues;
 it is accumulated over blocks of coordinates, which are centred one by one, so that nothing as large as the data is ever
-copied. Of more than `EXACT` shapes on a disk the modes are found by block Krylov over blocks of rows. Shapes stand in
-their file as differences from a template near their mean, in single precision; all sums are in double precision, in one
+copied. Of more than `EXACT` shapes on a disk the modes are found by block Krylov over blocks of rows. The file contains
+the shapes as differences from a template near their mean, in single precision; all sums are in double precision, in one
 order. Alignment is not done here.
 """
 
@@ -18,43 +18,43 @@ import numpy as np
 
 from shapespace.errors import InputError
 from shapespace.io.memory_cache import available_bytes
-from shapespace.model.krylov import Leading, Stop, largest_eigenpairs, leading
+from shapespace.model.krylov import LeadingEigenpairs, Stop, largest_eigenpairs, leading
 from shapespace.types import FloatArray
 
 Modes: TypeAlias = int | float | Literal["auto", "all"] | None
-"""Modes to keep: a number, a share of the variance below 1, `auto` (`choose_modes`), or `all`, which None is too."""
+"""Modes to keep: a number, a share of the variance below 1, `auto` (`choose_modes`), or `all`, the same as None."""
 EXACT = 15_000
-"""Shapes on a disk of which the Gram matrix is made: 1.8 GB."""
+"""Largest number of shapes on a disk for which the Gram matrix is formed: 1.8 GB."""
 _WHOLE, _FEW = 1000, 8
-"""Shapes of which all eigenvectors are found at once, which is then as quick as to find the first; of more shapes more
-than an eighth of the modes are."""
+"""Largest number of shapes, and for more shapes the largest ratio of their number to that of the modes, for which all
+eigenvectors are computed at once, which is then as fast as to compute the first ones."""
 _BASIS_BYTES = 768 << 20  # bytes of the Krylov basis in memory
 # vectors in a block: products of a few columns are slow, many cost memory
 _LEAST_BLOCK, _MOST_BLOCK = 32, 128
 _TO_ROUNDING = Stop(radians=1e-8, least_gap=1e-5, enough=1e-12)
 _BLOCK = 1024  # coordinates at a time, so that no centred copy of all data is in memory
 _NO_VARIANCE = 1e-10
-"""Modes with less than this share of the first mode's variance are rounding, not shape (erratum to P4)."""
+"""Modes with less than this share of the first mode's variance are rounding errors (erratum to P4)."""
 _ROUNDING, _NO_VARIATION = 64 * float(np.finfo(float).eps), 1e-12
-"""Coordinates of equal shapes differ by less than this share of their size; the share of the sum of squares of shapes
-on a disk that is rounding."""
+"""Largest difference of coordinates of equal shapes as a share of their size, and for shapes on a disk the share of the
+sum of squares that is rounding error."""
 ALL_EQUAL = "The training shapes are all equal, so there is no variation to model; give different ones."
 _TIED = 1.0 - 1e-6
 """Entries this close to a mode's largest tie with it, as left and right do in symmetric shapes."""
 
 
 class Table(Protocol):
-    """N rows of D numbers, one shape a row, in memory or in a file (`Spill`)."""
+    """N rows of D numbers, one shape per row, in memory or in a file (`Spill`)."""
 
     rows: int
     columns: int
 
     def row_blocks(self) -> Iterator[tuple[int, FloatArray]]:
-        """Yield the number of the first row, and rows, of the whole table in order."""
+        """Yield blocks of rows of the complete table in order, each with the number of its first row."""
         ...
 
     def column_blocks(self) -> Iterator[FloatArray]:
-        """Yield copies of some columns, of the whole table in order."""
+        """Yield copies of blocks of columns of the complete table in order."""
         ...
 
 
@@ -78,12 +78,12 @@ class PrincipalComponents:
     """The outcome of a PCA of N shapes with D coordinates.
 
     Args:
-        mean: (D,) mm.
+        mean: (D,) mean, mm.
         basis: (D, K) orthonormal columns, in order of falling variance, signs fixed.
-        variance: (K,) of the coefficients, mm^2, divisor N - 1.
-        total_variance: of all modes together, kept or not, mm^2.
+        variance: (K,) variances of the coefficients, mm^2, divisor N - 1.
+        total_variance: variance of all modes together, kept or not, mm^2.
         n_samples: N.
-        residuals: (K,) mm^2, |C v - lambda v| of each mode by a product with the covariance; None of shapes in
+        residuals: (K,) mm^2, |C v - lambda v| of each mode from a product with the covariance; None for shapes in
             memory, whose modes are exact to rounding.
     """
 
@@ -96,22 +96,22 @@ class PrincipalComponents:
 
 
 def check_share(share: float) -> None:
-    """Refuse a share of the variance that is none.
+    """Check a share of the variance.
 
     Raises:
-        InputError: it is outside (0, 1].
+        InputError: the share is outside (0, 1].
     """
     if not 0 < share <= 1:
         raise InputError(f"A share of the variance lies above 0 and at most at 1, not at {share:g}.")
 
 
 def modes_for_variance(variance: FloatArray, share: float, total: float | None = None) -> int:
-    """Return the smallest number of modes that hold `share` (0 < share <= 1) of `total`, or of the sum of `variance`.
+    """Return the smallest number of modes with the share `share` (0 < share <= 1) of the variance.
 
     Args:
-        variance: (R,) falling.
-        share: of the variance.
-        total: of all modes, where `variance` is not of all.
+        variance: (R,) variances, falling.
+        share: share of `total`.
+        total: total variance of all modes; None for the sum of `variance`.
 
     Raises:
         InputError: a share outside (0, 1].
@@ -129,38 +129,42 @@ def principal_components(
     passes: Path | None = None,
     on_pass: Callable[[int, float], None] | None = None,
 ) -> PrincipalComponents:
-    """Return the principal components of `shapes`: those of shapes in memory, and few on a disk, are exact.
+    """Return the principal components of `shapes`, exact in memory, and on a disk for at most `EXACT` shapes.
 
     Args:
-        shapes: (N, D) float64, one shape a row; C order avoids a copy. Or a table on a disk, mm, about a template; the
-            mean is returned about it too.
-        modes: how many, fewer if the samples determine fewer; a float below 1 for a share of the variance; `all`.
-        seed: of the first block of directions where there are many shapes.
-        passes: the folder where the passes over many shapes are kept; None keeps nothing.
-        on_pass: called with the number of a pass and the largest residual after it as a share of the first variance.
+        shapes: (N, D) float64, one shape per row; C order avoids a copy. Or a table on a disk, mm, about a template;
+            the mean is returned about it too.
+        modes: number of modes, fewer if the samples determine fewer; a float below 1 for a share of the variance;
+            `all`.
+        seed: seed of the first block of directions if there are many shapes.
+        passes: folder where the passes over many shapes are kept; None keeps nothing.
+        on_pass: function called with the number of a pass and the largest residual after it as a share of the first
+            variance.
 
     Raises:
-        InputError: fewer than two samples, values that are not finite, no variation at all, or more modes than memory
-            holds.
-        FileError: the file cannot be read, or a pass not kept.
+        InputError: fewer than two samples, values that are not finite, no variation at all, or more modes than fit
+            into memory.
+        FileError: the file cannot be read, or a pass cannot be kept.
     """
     table = _InMemory(shapes) if isinstance(shapes, np.ndarray) else shapes
     n, d, in_memory = table.rows, table.columns, isinstance(table, _InMemory)
     modes = checked_modes(modes, n) if in_memory else checked_large_modes(modes, n, d)
     covariance = Covariance.of(table)
     if in_memory or n <= EXACT:
-        variance, rows, total = _by_gram(covariance, modes, seed, exact=in_memory)
+        variance, rows, total = _components_by_gram(covariance, modes, seed, exact=in_memory)
         residuals = None
         if not in_memory:
             residuals = np.linalg.norm(covariance(rows.T) - rows.T * variance, axis=0)
     else:
-        # All modes of so many shapes were refused.
+        # All modes of so many shapes were rejected.
         total = covariance.total()
-        found = _leading(covariance, d, cast(int | float, modes), total, Stop(), seed, passes=passes, on_pass=on_pass)
+        found = _find_leading(
+            covariance, d, cast(int | float, modes), total, Stop(), seed, passes=passes, on_pass=on_pass
+        )
         if found is None:
             raise InputError(
-                f"The modes asked for cannot be separated from the next ones in {_columns(d)} directions, the number "
-                "that memory is reserved for; ask for fewer modes."
+                f"The requested modes cannot be separated from the next modes in {_max_columns(d)} directions, the "
+                "number that memory is reserved for; ask for fewer modes."
             )
         variance = varying(found.values)
         rows = np.ascontiguousarray(found.vectors.T[: len(variance)])
@@ -173,14 +177,14 @@ def plain_modes(modes: object) -> int | float | None:
     """Return a number of modes or a share of the variance as a plain number, or None for all.
 
     Raises:
-        InputError: it is something else, below one, or no share.
+        InputError: it is another object, below one, or not a share.
     """
     if isinstance(modes, np.integer | np.floating):
         modes = modes.item()
     if modes is None or modes == "all":
         return None
     if not isinstance(modes, int | float):
-        raise InputError(f"The modes must be a whole number, a share of the variance, or all, not {modes!r}.")
+        raise InputError(f"The modes must be an integer, a share of the variance, or all, not {modes!r}.")
     if isinstance(modes, float):
         check_share(modes)
     elif modes < 1:
@@ -189,10 +193,10 @@ def plain_modes(modes: object) -> int | float | None:
 
 
 def checked_modes(modes: Modes, n: int) -> int | float | None:
-    """Return the modes to be computed of n shapes: a number of at most n - 1, a share of the variance, or None for all.
+    """Return the modes to compute of n shapes: a number of at most n - 1, a share of the variance, or None for all.
 
     Raises:
-        InputError: it is something else, or there are fewer than two shapes.
+        InputError: the number is invalid, or there are fewer than two shapes.
     """
     if n < 2:
         raise InputError(f"A shape model needs at least two training shapes, not {n}.")
@@ -201,10 +205,10 @@ def checked_modes(modes: Modes, n: int) -> int | float | None:
 
 
 def checked_large_modes(modes: Modes, n: int, d: int) -> int | float | None:
-    """Return `modes` as asked for of n shapes of d numbers on a disk, before they are looked at.
+    """Return the checked number of modes of n shapes of d numbers on a disk, before the shapes are read.
 
     Raises:
-        InputError: more modes than memory holds.
+        InputError: more modes than fit into memory.
     """
     modes = checked_modes(modes, n)
     count = n - 1 if modes is None else modes if isinstance(modes, int) else 1
@@ -223,7 +227,7 @@ def checked_large_modes(modes: Modes, n: int, d: int) -> int | float | None:
 
 
 def varying(variance: FloatArray) -> FloatArray:
-    """Return those of the falling variances (K,) that are shape and not rounding."""
+    """Return those of the falling variances (K,) that are not rounding errors."""
     return variance[variance > _NO_VARIANCE * variance[0]]
 
 
@@ -236,7 +240,7 @@ def fix_signs(rows: FloatArray) -> None:
 
 
 def syrk(block: FloatArray, onto: FloatArray | None = None) -> FloatArray:
-    """Return the lower triangle of block @ block.T, (N, N) Fortran-ordered, added to `onto` where given."""
+    """Return the lower triangle of block @ block.T, (N, N) Fortran-ordered, added to `onto` if given."""
     from scipy.linalg import blas
 
     dsyrk = cast(Any, blas).dsyrk
@@ -248,11 +252,11 @@ def syrk(block: FloatArray, onto: FloatArray | None = None) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """The covariance C of the rows of a table, by its products.
+    """The covariance C of the rows of a table, as an operator.
 
     Args:
         table: N rows of D numbers.
-        mean: (D,) of the rows.
+        mean: (D,) mean of the rows.
         squares: sum of all squares.
     """
 
@@ -262,7 +266,7 @@ class Covariance:
 
     @staticmethod
     def of(table: Table) -> Covariance:
-        """Find mean and squares by one pass over the rows.
+        """Compute mean and squares in one pass over the rows.
 
         Raises:
             InputError: values that are not finite.
@@ -273,14 +277,14 @@ class Covariance:
             squares += float(np.vdot(block, block))
         mean /= table.rows
         if not (np.isfinite(squares) and np.isfinite(mean).all()):
-            raise InputError("The training shapes hold values that are not finite.")
+            raise InputError("The training shapes have values that are not finite.")
         return Covariance(table, mean, squares)
 
     def total(self) -> float:
         """Return the trace of C.
 
         Raises:
-            InputError: it is rounding.
+            InputError: the variation is rounding error.
         """
         n = self.table.rows
         centred = self.squares - n * float(self.mean @ self.mean)
@@ -318,11 +322,11 @@ class Covariance:
         return onto
 
 
-def _columns(d: int) -> int:
+def _max_columns(d: int) -> int:
     return _BASIS_BYTES // (8 * d)
 
 
-def _leading(
+def _find_leading(
     apply: Callable[[FloatArray], FloatArray],
     size: int,
     modes: int | float,
@@ -331,16 +335,16 @@ def _leading(
     seed: int,
     passes: Path | None = None,
     on_pass: Callable[[int, float], None] | None = None,
-) -> Leading | None:
+) -> LeadingEigenpairs | None:
     half = -(-modes // 2) if isinstance(modes, int) else 0
     block = min(max(half, _LEAST_BLOCK), _MOST_BLOCK)
-    most = max(_columns(size), modes + 4 * block if isinstance(modes, int) else 0)
+    most = max(_max_columns(size), modes + 4 * block if isinstance(modes, int) else 0)
     return leading(
         apply, size, modes, total, block=block, most_columns=most, stop=stop, seed=seed, passes=passes, on_pass=on_pass
     )
 
 
-def _by_gram(
+def _components_by_gram(
     covariance: Covariance, modes: int | float | None, seed: int, *, exact: bool
 ) -> tuple[FloatArray, FloatArray, float]:
     """Return variances (K,), modes (K, D) and the total variance, by the eigenvectors of the Gram matrix (P4, P5).
@@ -354,7 +358,7 @@ def _by_gram(
         from scipy.linalg import blas
 
         dsymm = cast(Any, blas).dsymm
-        pairs = _leading(lambda Y: dsymm(1.0, gram, Y, lower=1), n, modes, trace, _TO_ROUNDING, seed)
+        pairs = _find_leading(lambda Y: dsymm(1.0, gram, Y, lower=1), n, modes, trace, _TO_ROUNDING, seed)
     if pairs is None:
         pairs = largest_eigenpairs(gram, modes if isinstance(modes, int) else n - 1, overwrite=True)
     values, vectors = pairs[:2]
@@ -371,7 +375,7 @@ def _by_gram(
 
 
 def orthonormal_rows(rows: FloatArray) -> None:
-    """Give modes (K, D), orthonormal but for rounding, their signs, and take the rounding out, in place."""
+    """Orthonormalise modes (K, D), which are orthonormal except for rounding, and fix their signs, in place."""
     fix_signs(rows)
     # Faint modes lose orthogonality by the square of the spread of the spectrum; one Cholesky step restores it.
     overlap = rows @ rows.T

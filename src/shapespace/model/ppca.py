@@ -6,11 +6,11 @@ distributions of the mean and W and the likeliest noise (M): each vertex from th
 covariances count, missing vertices do not narrow the variances. Roweis, NIPS 10, 1998; Tipping and Bishop, JRSS B
 61(3), 1999. Equations Cn are those of docs/missing.md.
 
-There are far more coordinates than shapes, so that the likeliest W alone follows the noise of what few shapes show, and
-fills worse than the mean does. So W has a normal prior, a width a mode, and its covariance counts too (variational
-Bayes: Bishop, ICANN 1999; Ilin and Raiko, JMLR 11, 2010); modes for which nothing speaks lose their width by
-themselves. Nothing of 3V x 3V is ever made: a round costs one K x K system a shape, and one a pattern of missing
-vertices.
+There are far more coordinates than shapes, so the likeliest W alone overfits vertices that few shapes observe, and
+predicts missing vertices worse than the mean does. So W has a normal prior, one width per mode, and its covariance
+counts too (variational Bayes: Bishop, ICANN 1999; Ilin and Raiko, JMLR 11, 2010); the width of modes without evidence
+decreases to zero. No array of 3V x 3V is formed: a round costs one K x K system per shape, and one per pattern of
+missing vertices.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from scipy.linalg import solve_triangular
 from shapespace.types import BoolArray, FloatArray, IntArray
 
 _LEAST_NOISE = 1e-9
-"""Of the variance of a coordinate: shapes without noise do not determine it."""
+"""Smallest noise as a share of the variance of a coordinate: shapes without noise do not determine it."""
 _FIRST_NOISE = 1e-3
-"""Of the variance, at least: without noise nothing would move."""
+"""Smallest initial noise as a share of the variance: without noise the iteration would not move."""
 _CONVERGED = 1e-5
-"""Nats a coordinate that is observed."""
+"""Increase of the bound, in nats per observed coordinate, at which the iteration ends."""
 _MOST_ROUNDS = 60  # limit of EM iterations
 _BLOCK = 512  # vertices at a time; bounds the memory of their (k + 1)^2 moments
 
@@ -38,14 +38,15 @@ class Ppca:
     """Probabilistic PCA of N shapes with V vertices, K modes and P patterns of missing vertices.
 
     Args:
-        W: (V, 3, K + 1) mm, how each vertex moves with each of y, and last the mean.
-        W_covariance: (P, K + 1, K + 1) of each coordinate of the vertices of a pattern.
+        W: (V, 3, K + 1) mm, displacement of each vertex by each of y, and last the mean.
+        W_covariance: (P, K + 1, K + 1) covariance of W for each coordinate of the vertices of a pattern.
         noise: residual variance of a coordinate, mm^2.
         y: (N, K + 1) means of the latent coefficients of each shape, in standard deviations, and last a one.
-        y_covariance: (N, K + 1, K + 1) of the same.
+        y_covariance: (N, K + 1, K + 1) covariances of the latent coefficients of each shape.
         width: (K,) variance of a coordinate of each mode, mm^2.
-        patterns: which vertices are missing where.
-        bounds: (rounds,) of the log probability of the observed vertices, nats, up to a constant; they never fall.
+        patterns: patterns of the missing vertices.
+        bounds: (rounds,) bound of the log probability of the observed vertices after each round, nats, up to a
+            constant; it never falls.
     """
 
     W: FloatArray
@@ -74,9 +75,9 @@ class Patterns:
 
     Args:
         missing: (P, N) True where the vertices of a pattern are missing in a shape.
-        of_vertex: (V,) the pattern of each.
-        count: (P,) how many vertices have it.
-        hidden: the missing vertices of each of the N shapes.
+        of_vertex: (V,) pattern of each vertex.
+        count: (P,) number of vertices of each pattern.
+        hidden: missing vertices of each of the N shapes.
     """
 
     missing: BoolArray
@@ -96,7 +97,7 @@ class Patterns:
 
     @cached_property
     def weight(self) -> FloatArray:
-        """(P,) coordinates of each pattern."""
+        """(P,) number of coordinates of each pattern."""
         return 3.0 * self.count.astype(np.float64)
 
 
@@ -109,8 +110,8 @@ def ppca(
 
     Args:
         shapes: (N, V, 3) mm; missing vertices have an initial guess, such as the mean.
-        observed: (N, V), each vertex in at least one shape.
-        modes: K, below N; those without evidence vanish.
+        observed: (N, V) True for observed vertices; each vertex is observed in at least one shape.
+        modes: K, below N; modes without evidence vanish.
     """
     patterns, n_observed = Patterns.of(observed), 3 * int(observed.sum())
     about = shapes.mean(axis=0)
@@ -144,7 +145,7 @@ def ppca(
 
 
 def _from_complete(shapes: FloatArray, modes: int) -> tuple[FloatArray, float]:
-    """Return W (V, 3, K + 1), with a mean of zero last, and the noise: the likeliest of complete shapes."""
+    """Return W (V, 3, K + 1), with a mean of zero last, and the noise: the maximum likelihood of complete shapes."""
     n, vertices = shapes.shape[:2]
     flat = (shapes - shapes.mean(axis=0)).reshape(n, -1)
     values, vectors = np.linalg.eigh(flat @ flat.T)
@@ -201,12 +202,12 @@ def _maximise(
     A vertex has its own normal equations, over the shapes that observe it; they differ by the pattern of missing ones.
 
     Args:
-        centred: (N, V, 3), zero at missing vertices.
-        patterns: which vertices are missing where.
-        y: (N, K + 1).
-        y_covariance: (N, K + 1, K + 1).
+        centred: (N, V, 3) centred shapes, zero at missing vertices.
+        patterns: patterns of the missing vertices.
+        y: (N, K + 1) means of the latent coefficients.
+        y_covariance: (N, K + 1, K + 1) covariances of the latent coefficients.
         ridge: (K + 1,) noise over the width of the prior.
-        noise: mm^2.
+        noise: residual variance of a coordinate, mm^2.
     """
     n, k1 = y.shape
     products = (y[:, :, None] * y[:, None, :] + y_covariance).reshape(n, -1)
@@ -220,12 +221,12 @@ def _maximise(
         inverse: FloatArray = np.asarray(np.linalg.inv(systems), dtype=np.float64)
         covariance[part] = noise * inverse
         weight = patterns.weight[part]
-        # Of these coordinates the trace of W's covariance times the products of y.
+        # Trace of the covariance of W times the products of y, over these coordinates.
         explained -= noise * float(weight @ (k1 - np.einsum("pkk,k->p", inverse, ridge)))
         bound += 0.5 * float(weight @ (k1 * np.log(noise) - np.linalg.slogdet(systems)[1]))
     for start in range(0, len(W), _BLOCK):
         part = slice(start, start + _BLOCK)
         W[part] = right[part] @ (covariance[patterns.of_vertex[part]] / noise)  # C23
-    # What the likeliest plane explains, with the pull of the prior taken off again.
+    # The explained squares of the likeliest plane, without the pull of the prior.
     explained += float((W * right).sum() + (W**2 @ ridge).sum())
     return W, covariance, explained, bound

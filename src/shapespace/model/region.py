@@ -1,8 +1,8 @@
-"""A model of a part of its surface: what a fit that is held to a region is made with.
+"""A model of a part of its surface, for fits that are restricted to a region.
 
-The region's vertices vary as the whole model has them vary: the modes of the part are the principal components of the
-model's own modes there, and each coefficient vector of one stands for one of the other. So nothing beyond the region
-affects the fit, and its result is given in the coefficients of the full model.
+The region's vertices vary as in the complete model: the modes of the part are the principal components of the
+model's own modes there, and each coefficient vector of the part corresponds to one of the model. So the surface beyond
+the region does not affect the fit, whose result is given in the coefficients of the complete model.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from shapespace.model.shape_model import ShapeModel, region_vertices
 from shapespace.types import BoolArray, FloatArray
 
 _FAINTEST = 1e-7
-"""Share of the first standard deviation below which a mode of the part is rounding."""
+"""Share of the first standard deviation below which a mode of the part is rounding error."""
 _MAX_PARTS = 4
 """Largest number of parts of one model in the cache; the fits of a batch share one."""
 
@@ -28,9 +28,9 @@ class Part:
     """A part of a model.
 
     Args:
-        model: of the part alone, K' modes.
-        inside: (V,) which vertices of the whole it has.
-        lift: (K, K') from z of the part to z of the whole; its columns are orthonormal.
+        model: shape model of the part alone, K' modes.
+        inside: (V,) True for the vertices of the complete model that are in the part.
+        lift: (K, K') from z of the part to z of the complete model; its columns are orthonormal.
     """
 
     model: ShapeModel
@@ -39,24 +39,25 @@ class Part:
 
     @staticmethod
     def of(full: ShapeModel, region: str | tuple[int, ...]) -> Part:
-        """Return the part of `whole` in `region`, one of its regions by name or vertices.
+        """Return the part of `full` in `region`, one of its regions by name or vertices.
 
         Raises:
             InputError: there is no such region, or no triangle lies in it.
         """
-        return _part(full, region)
+        return _build_part(full, region)
 
     def to_b(self, b: FloatArray, full: ShapeModel) -> FloatArray:
-        """Return the coefficients (K,) mm of the whole that `b` (k,) mm of the part stands for."""
+        """Return the coefficients (K,) mm of the complete model for the coefficients `b` (k,) mm of the part."""
         return full.stddev * (self.lift[:, : len(b)] @ (b / self.model.stddev[: len(b)]))
 
     def to_covariance(self, b_covariance: FloatArray, full: ShapeModel, variance: FloatArray) -> FloatArray:
-        """Return the covariance (K, K) mm^2 of the whole's coefficients, of that (K', K') of the part's.
+        """Return the covariance (K, K) mm^2 of the complete model's coefficients, from that of the part's.
 
         Args:
-            b_covariance: of all the part's coefficients.
-            full: the model that this is a part of.
-            variance: (K,) mm^2 of the whole's where nothing is seen, as of what no vertex of the part shows.
+            b_covariance: (K', K') covariance of all coefficients of the part, mm^2.
+            full: the complete model.
+            variance: (K,) prior variances of the complete model's coefficients, mm^2, for the directions that no vertex
+                of the part shows.
         """
         to = full.stddev[:, None] * self.lift / self.model.stddev
         unseen = np.eye(len(self.lift)) - self.lift @ self.lift.T
@@ -65,13 +66,13 @@ class Part:
 
 
 @cached_with_owner(limit=_MAX_PARTS)
-def _part(full: ShapeModel, region: str | tuple[int, ...]) -> Part:
+def _build_part(full: ShapeModel, region: str | tuple[int, ...]) -> Part:
     if isinstance(region, str):
         if region not in full.regions:
             there = f"it has {', '.join(full.regions)}" if full.regions else "it has none"
             raise InputError(
-                f"The model has no region {region!r} ({there}); give one of them, or a CSV file of vertices, or build "
-                "the model with --region NAME=FILE."
+                f"The model has no region {region!r} ({there}); give one of its regions, or a CSV file of vertices, or "
+                "build the model with --region NAME=FILE."
             )
         vertices = full.regions[region]
     else:
@@ -82,7 +83,7 @@ def _part(full: ShapeModel, region: str | tuple[int, ...]) -> Part:
     if faces is not None:
         mean, faces = without_vertices(full.mean_vertices, faces, inside)
         if not len(faces):
-            raise InputError("No triangle of the model lies in the region; give one with whole triangles.")
+            raise InputError("No triangle of the model lies in the region; give a region with complete triangles.")
     rows = full.vertex_basis.reshape(full.n_vertices, 3, -1)[inside].reshape(3 * len(mean), -1)
     basis, stddev, lift = np.linalg.svd(rows * full.stddev, full_matrices=False)
     significant = stddev > _FAINTEST * stddev[0]

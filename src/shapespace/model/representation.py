@@ -1,4 +1,4 @@
-"""How a surface becomes the vector that PCA sees: the one place where shapes are flattened and restored."""
+"""Representations of a surface as a vector for PCA: the only module where shapes are flattened and restored."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from shapespace.geometry.flatten import disc_map
 from shapespace.types import BoolArray, FloatArray, Mesh, read_only
 
 CONTROL_POINTS = (24, 24)
-"""Along each side of the square, where nobody says how many."""
+"""Default number of control points along each side of the square."""
 
 
 class Representation(Protocol):
     """Turns vertices into a vector and back; distances and inner products are always those of decoded vertices."""
 
     takes_holes: ClassVar[bool]
-    """Whether `encode` takes vertices that are not-a-number."""
+    """Whether `encode` accepts vertices that are not-a-number."""
 
     @classmethod
     def check(cls, control_points: tuple[int, int] | None) -> None:
-        """Refuse numbers of control points that it cannot have, before any mesh is read.
+        """Check the numbers of control points, before any mesh is read.
 
         Raises:
-            InputError: they cannot be.
+            InputError: this representation cannot have them.
         """
         ...
 
@@ -38,24 +38,24 @@ class Representation(Protocol):
 
         Args:
             template: usually the mean of the training shapes.
-            control_points: along u and v; None for the usual number, or where there are none.
+            control_points: numbers along u and v; None for the default, or for representations without control points.
 
         Raises:
-            InputError: this representation cannot be had of such surfaces.
+            InputError: such surfaces do not have this representation.
         """
         ...
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]]) -> Representation:
-        """Return the representation that `arrays` gave.
+        """Return the representation from its `arrays`.
 
         Raises:
-            InputError: they do not belong together.
+            InputError: the arrays do not belong together.
         """
         ...
 
     def arrays(self) -> Mapping[str, npt.NDArray[Any]]:
-        """Return what a model file keeps of it, by the names of the datasets."""
+        """Return the arrays for the model file, by the names of the datasets."""
         ...
 
     def encode(self, vertices: FloatArray) -> FloatArray:
@@ -67,7 +67,7 @@ class Representation(Protocol):
         ...
 
     def directions(self, basis: FloatArray) -> FloatArray:
-        """Return (3V, K): how the vertices move along each column of `basis` (D, K)."""
+        """Return (3V, K) displacements of the vertices along each column of `basis` (D, K)."""
         ...
 
 
@@ -78,7 +78,7 @@ class Vertices:
 
     @classmethod
     def check(cls, control_points: tuple[int, int] | None) -> None:
-        """Refuse any control points.
+        """Check that there are no control points.
 
         Raises:
             InputError: they are given.
@@ -88,7 +88,7 @@ class Vertices:
 
     @classmethod
     def of(cls, template: Mesh, control_points: tuple[int, int] | None) -> Vertices:
-        """Return it; `template` is not needed.
+        """Return the representation; `template` is not needed.
 
         Raises:
             InputError: `control_points` are given.
@@ -98,11 +98,11 @@ class Vertices:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]]) -> Vertices:
-        """Return it; there is nothing to be kept in a file."""
+        """Return the representation; a model file contains no arrays for it."""
         return cls()
 
     def arrays(self) -> Mapping[str, npt.NDArray[Any]]:
-        """Return nothing."""
+        """Return no arrays."""
         return {}
 
     def encode(self, vertices: FloatArray) -> FloatArray:
@@ -121,16 +121,17 @@ class Vertices:
 class BSplineSurface:
     """Control points of a tensor-product cubic B-spline surface over a one-to-one map of the template, D = 3mn.
 
-    Control points are those of regularised least squares, every vertex counting the same, so that |x| is the same
-    norm as that of `Vertices`. Vertices that are not-a-number have no weight: the thin-plate energy decides there.
+    Control points are those of regularised least squares with equal weights of the vertices, so that |x| is the same
+    norm as that of `Vertices`. Vertices that are not-a-number have no weight: the thin-plate energy determines them.
 
     Args:
-        uv: (V, 2) of each vertex on the unit square.
-        counts: m control points along u and n along v; the vector holds x, y, z of (0, 0), then of (0, 1), and so on.
-        detail: (V, 3) mm added to the spline's vertices, the same for every shape; None for nothing.
+        uv: (V, 2) position of each vertex on the unit square.
+        counts: m control points along u and n along v; the vector contains x, y, z of (0, 0), then of (0, 1), and so
+            on.
+        detail: (V, 3) mm added to the spline's vertices, the same for every shape; None for no detail.
 
     Raises:
-        InputError: places off the square, too few or too many control points.
+        InputError: positions off the square, too few or too many control points.
     """
 
     takes_holes: ClassVar[bool] = True
@@ -140,13 +141,13 @@ class BSplineSurface:
         self.spline = SplineSquare(read_only(uv), counts)
         self.detail = None if detail is None else read_only(detail)
         if self.detail is not None and not (self.detail.shape == (len(uv), 3) and np.isfinite(self.detail).all()):
-            raise InputError("The detail of a B-spline surface must be one finite offset (3,) a vertex.")
-        # Nothing but for rounding and smoothing; with it the template comes back exactly.
+            raise InputError("The detail of a B-spline surface must be one finite offset (3,) per vertex.")
+        # Zero except for rounding and smoothing; with it the template is restored exactly.
         self._net_of_detail = 0.0 if self.detail is None else self.spline.fit(self.detail)
 
     @classmethod
     def check(cls, control_points: tuple[int, int] | None) -> None:
-        """Refuse too few or too many control points.
+        """Check that there are neither too few nor too many control points.
 
         Raises:
             InputError: there are too few or too many.
@@ -158,7 +159,7 @@ class BSplineSurface:
         """Return the surfaces over `disc_map` of `template`.
 
         Raises:
-            MeshError: the template cannot be spread out on a square.
+            MeshError: the template cannot be mapped to a square.
             InputError: too few or too many control points.
         """
         cls.check(control_points)
@@ -175,10 +176,10 @@ class BSplineSurface:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]]) -> BSplineSurface:
-        """Return the surfaces that `arrays` gave.
+        """Return the surfaces from their `arrays`.
 
         Raises:
-            InputError: one is missing, or they do not belong together.
+            InputError: an array is missing, or they do not belong together.
         """
         missing = [name for name in ("uv", "control_counts", "degree") if name not in arrays]
         if missing or (cls._keeps_detail and "detail" not in arrays):
@@ -190,7 +191,7 @@ class BSplineSurface:
         return cls(arrays["uv"].astype(np.float64), (m, n), detail)
 
     def arrays(self) -> Mapping[str, npt.NDArray[Any]]:
-        """Return `uv` (V, 2), `control_counts` (2,) and `degree` (), and `detail` (V, 3) where it is kept."""
+        """Return `uv` (V, 2), `control_counts` (2,) and `degree` (), and `detail` (V, 3) if the file keeps it."""
         arrays: dict[str, npt.NDArray[Any]] = {
             "uv": self.spline.uv,
             "control_counts": np.array(self.spline.counts, dtype=np.int32),
@@ -201,7 +202,7 @@ class BSplineSurface:
     def encode(self, vertices: FloatArray) -> FloatArray:
         """Return (..., 3mn) from vertices (..., V, 3), of which some may be not-a-number."""
         shapes = vertices.reshape(-1, *vertices.shape[-2:])
-        # One by one, so that a shape is coded to the last bit as it is among many.
+        # Shapes are encoded one at a time, so that the code of a shape does not depend on the others, to the last bit.
         out = np.stack([self._control_points(shape).ravel() for shape in shapes])
         return out.reshape(*vertices.shape[:-2], -1)
 
@@ -233,7 +234,7 @@ class BSplineSurface:
 
 
 class DetailedBSplineSurface(BSplineSurface):
-    """B-spline surfaces that carry what the spline cannot hold of the mean, the same for every shape."""
+    """B-spline surfaces with the detail of the mean that the spline cannot represent, the same for every shape."""
 
     _keeps_detail: ClassVar[bool] = True
 
@@ -243,14 +244,14 @@ REPRESENTATIONS: Mapping[str, type[Representation]] = {
     "bspline": BSplineSurface,
     "bspline-detail": DetailedBSplineSurface,
 }
-"""Representations by the name that a model file carries."""
+"""Representations by their names in model files."""
 
 
 def representation_named(name: str, control_points: tuple[int, int] | None) -> type[Representation]:
-    """Return the representation of that name, which can have these control points.
+    """Return the representation of that name, and check its control points.
 
     Raises:
-        InputError: there is none, or it cannot.
+        InputError: there is no such representation, or it cannot have these control points.
     """
     if name not in REPRESENTATIONS:
         raise InputError(f"There is no representation {name!r}; choose one of {', '.join(REPRESENTATIONS)}.")

@@ -1,4 +1,4 @@
-"""The shape space: a mean, an orthonormal basis of modes, and how far each mode reaches (P1-P6)."""
+"""The shape model: a mean, an orthonormal basis of modes, and the standard deviation of each mode (P1-P6)."""
 
 from __future__ import annotations
 
@@ -51,54 +51,56 @@ _LEAST_NOISE = 1e-12  # share of the first mode's variance, so that models witho
 _SHARE_TOLERANCE = 1e-12  # share of variance; cumulative sums in float64 are off by less
 _TOLD = 300  # characters of a library's error that a message repeats
 _FILE = "_file"
-"""Attribute that is no field: neither copies nor states of a model have it."""
+"""Attribute that is not a field: neither copies nor states of a model have it."""
 _VECTOR = "mean"
-"""In `ShapeModel.coding`: what the representation makes of the mean shape, where that is not its vertices."""
+"""Key in `ShapeModel.coding` of the code of the mean shape, for representations other than vertices."""
 _ROUNDING = 64 * float(np.finfo(float).eps)
 _WIDEST = 1e6
-"""Standard deviations lie between these shares of the norm of the mean shape's vertices about their middle."""
+"""Smallest and largest standard deviation as shares of the norm of the mean shape's vertices about their centre."""
 
 _LEAST_MM, _MOST_MM = 1.0, 3000.0
-"""Beyond this the largest extent of an object is more likely given in another unit."""
+"""Range of the largest extent of an object in mm; outside it, the object is more likely in another unit."""
 
 
 @dataclass(frozen=True, eq=False)
 class ShapeModel:
     """A surface is close to mean + basis @ b, with b_k of standard deviation stddev_k (P6).
 
-    Coefficients b are in mm; z = b / stddev are their values in standard deviations. Functions here take and give b;
-    `to_z` and `to_b` turn one into the other.
+    Coefficients b are in mm; z = b / stddev are their values in standard deviations. The methods take and return b;
+    `to_z` and `to_b` convert between them.
 
     Args:
         mean: (V, 3) vertices of the mean shape, mm. It may be given as (D,); D = 3V for vertices, 3mn for B-splines of
             m x n control points.
         basis: (D, K) columns that move the vertices orthonormally; for vertices they are themselves orthonormal.
-        stddev: (K,) of each coefficient, mm.
-        total_variance: of all modes of the training set, kept or not, mm^2; of those left out where `held_out`.
+        stddev: (K,) standard deviation of each coefficient, mm.
+        total_variance: variance of all modes of the training set, kept or not, mm^2; if `held_out`, that of the
+            held-out shapes.
         n_training: number of training shapes.
-        faces: (F, 3) int32 or None for point models.
-        gauge: `form` (rigid; size lives in the modes) or `shape` (size divided out).
-        landmarks: named points on the surface; a mapping of name to vertex may be given for those at vertices.
+        faces: (F, 3) int32 triangles, or None for point models.
+        gauge: `form` (rigid; size is part of the modes) or `shape` (size removed).
+        landmarks: named points on the surface; a mapping of name to vertex may be given for landmarks at vertices.
         representation: a name of `REPRESENTATIONS`.
-        coding: the arrays of that representation, and the mean in it; none for vertices.
-        provenance: what it was made from, in words.
+        coding: arrays of that representation, and the mean in it; empty for vertices.
+        provenance: description of the training data.
         licence: licence of the training data.
-        held_out: whether variances are those of shapes that took no part in the modes, so that they hold for new ones.
-        residuals: (K,) mm^2, |C v - lambda v| of each mode where it was found by passes over the shapes (PCA beyond
-            memory); None where the modes are exact to rounding.
-        regions: name -> (n,) int32, the vertices of a part of the surface that a fit can be held to.
-        is_n_training_known: False of a model of another tool whose file does not state the number of training shapes,
-            such as a Gaussian process; `n_training` is then K + 1.
-        left_out: how many modes were found and not kept, since alignment or rounding made them; no file holds it.
-        training: the training shapes, by which results are calibrated (docs/uncertainty.md); None of models of other
-            tools, and without `training` when the model is shared. The content hash does not depend on them, and
+        held_out: whether variances were estimated on shapes that took no part in the modes, so that they are valid for
+            new shapes.
+        residuals: (K,) mm^2, |C v - lambda v| of each mode if it was found by passes over the shapes (PCA beyond
+            memory); None if the modes are exact to rounding.
+        regions: name -> (n,) int32, the vertices of a part of the surface that a fit can be restricted to.
+        is_n_training_known: whether the number of training shapes is known; False for a model of another tool whose
+            file does not state it, such as a Gaussian process; `n_training` is then K + 1.
+        left_out: number of modes that were omitted, since alignment or rounding alone caused them; it is not saved.
+        training: training shapes, by which results are calibrated (docs/uncertainty.md); None for models of other
+            tools, and for models that are shared without `training`. The content hash does not depend on them, and
             copies and other processes do not have them.
         dropped_vertices: (U,) int32 vertices of the training meshes that are not in the model, since too few meshes
-            observe them; its own are the V others in order. `project` takes shapes with and without them.
+            observe them; its own are the V others in order. `project` accepts shapes with and without them.
         notes: sentences on its training shapes and its number of modes; the content hash does not depend on them.
 
     Raises:
-        InputError: arrays whose shapes do not belong together, or standard deviations that cannot be.
+        InputError: arrays whose shapes do not belong together, or impossible standard deviations.
     """
 
     mean: FloatArray
@@ -133,7 +135,7 @@ class ShapeModel:
 
     def __post_init__(self) -> None:
         given, basis, stddev = read_only(self.mean), read_only(self.basis), read_only(self.stddev)
-        # A copy of a B-spline model gives the vertices, which do not determine its control points.
+        # A copy of a B-spline model passes the vertices, which do not determine its control points.
         mean = read_only(self.coding.get(_VECTOR, given) if given.ndim == 2 else given).reshape(-1)
         d, k = len(mean), len(stddev)
         plain = given.ndim == 1 or given.shape[1:] == (3,)
@@ -169,18 +171,18 @@ class ShapeModel:
         if given.ndim == 2 and arrays and not np.array_equal(given, checked.vertices):
             raise InputError("The vertices of this mean are not those of its B-spline; give its control points (D,).")
         set_fields(self, mean=checked.vertices, faces=checked.faces)
-        _refuse_impossible(stddev, checked.vertices)
+        _check_stddev(stddev, checked.vertices)
         if self.training is not None:
             rows, rest = self.training.rest.shape
             if (rest and rows != checked.vertices.size) or self.training.coefficients.shape[1] != k + rest:
                 raise InputError(f"The training shapes do not belong to a model of {k} modes.")
-            _refuse_impossible(self.training.stddev[k:], checked.vertices, first_mode=k)
-            _refuse_impossible(np.maximum(self.training.stddev[:k], stddev), checked.vertices)
+            _check_stddev(self.training.stddev[k:], checked.vertices, first_mode=k)
+            _check_stddev(np.maximum(self.training.stddev[:k], stddev), checked.vertices)
         source = len(checked.vertices) + len(self.dropped_vertices)
         none = np.zeros(0, dtype=np.int32)
         dropped = region_vertices(self.dropped_vertices, source, "dropped") if len(self.dropped_vertices) else none
         if len(dropped) != len(self.dropped_vertices):
-            raise InputError("A dropped vertex of a shape model is named twice.")
+            raise InputError("A dropped vertex of a shape model is listed twice.")
         self.landmarks.check(len(checked.vertices))
         regions = {
             str(name): region_vertices(vertices, len(checked.vertices), name) for name, vertices in self.regions.items()
@@ -251,7 +253,7 @@ class ShapeModel:
         keep_shapes: Path | None = None,
         tell: Tell | None = None,
     ) -> ShapeModel:
-        """Return the model of the shapes that this one was made of and of `meshes`; see `build_model.extend_model`."""
+        """Return the model of this model's training shapes and of `meshes`; see `build_model.extend_model`."""
         config = lazy_import("BuildConfig")(modes=modes, provenance=provenance, licence=licence, seed=seed)
         return lazy_import("extend_model")(
             self, meshes, shapes, config, scratch=scratch, keep_shapes=keep_shapes, log=tell
@@ -259,7 +261,7 @@ class ShapeModel:
 
     @property
     def _vector(self) -> FloatArray:
-        """(D,) the mean shape as its representation has it."""
+        """(D,) mean shape in its representation."""
         return self.coding.get(_VECTOR, self.mean.reshape(-1))
 
     @cached_property
@@ -283,7 +285,7 @@ class ShapeModel:
 
     @cached_property
     def vertex_basis(self) -> FloatArray:
-        """How the vertices move along each mode, (3V, K), orthonormal columns; `basis` itself for vertices."""
+        """(3V, K) displacements of the vertices along each mode, orthonormal columns; `basis` itself for vertices."""
         return self._coder.directions(self.basis)
 
     @cached_property
@@ -298,44 +300,44 @@ class ShapeModel:
 
     @property
     def noise_variance(self) -> float:
-        """Variance per coordinate of the vertices that the kept modes leave over, mm^2.
+        """Variance per coordinate of the vertices outside the kept modes, mm^2.
 
-        Tipping and Bishop, JRSS B 61(3), 1999. It counts what a representation cannot hold of how shapes vary.
+        Tipping and Bishop, JRSS B 61(3), 1999. It includes the variation that the representation cannot describe.
         """
         of_modes = float((self.stddev**2).sum())
         return max(self.total_variance - of_modes, 0.0) / max(3 * self.n_vertices - self.n_modes, 1)
 
     @cached_property
     def cumulative_variance(self) -> FloatArray:
-        """Share of the training variance that the first k modes hold, (K,)."""
+        """(K,) share of the training variance of the first k modes."""
         return np.cumsum(self.stddev**2) / self.total_variance
 
     def modes_for_variance(self, share: float) -> int | None:
-        """Return how many modes hold `share` of the training variance; None where all kept modes hold less."""
+        """Return the number of modes with `share` of the training variance; None if all kept modes have less."""
         if self.cumulative_variance[-1] < share - _SHARE_TOLERANCE:
             return None
         return int(np.searchsorted(self.cumulative_variance, share - _SHARE_TOLERANCE)) + 1
 
     @cached_property
     def content_hash(self) -> str:
-        """SHA-256 of everything the model is, whatever file it stands in."""
+        """SHA-256 of all data of the model, independent of its file."""
         return model_file.hash_of(self.fields())
 
     @property
     def in_file(self) -> bool:
-        """Whether it was read from a file or saved to one: later runs will need what was made of it again."""
+        """Whether it was read from a file or saved to one, so that later runs need its derived data again."""
         return self.file is not None
 
     @property
     def file(self) -> Path | None:
-        """The file that it was read from or saved to last, in shapespace's own format; None where there is none."""
+        """File that it was read from or saved to last, in shapespace's own format; None without a file."""
         return vars(self).get(_FILE)
 
     def reconstruct(self, b: npt.ArrayLike) -> FloatArray:
         """Return the vertices (V, 3), mm, of the shape with coefficients `b` (P6).
 
         Args:
-            b: (k,) mm, k at most K; missing ones are zero.
+            b: (k,) coefficients, mm, k at most K; missing coefficients are zero.
 
         Raises:
             InputError: more coefficients than modes, or values that are not finite.
@@ -354,12 +356,13 @@ class ShapeModel:
         Args:
             shape: a mesh or (V, 3) vertices, mm, in the order of the model's vertices or of those of its training
                 meshes, of which `dropped_vertices` are not used. Vertices that are not-a-number or not observed are
-                missing: b is then the likeliest by the others.
-            align: find its pose along with b, by the model's gauge; False if it is in the model's frame already.
+                missing: b is then the likeliest given the others.
+            align: whether to estimate its pose along with b, by the model's gauge; False if the shape is in the
+                model's frame already.
 
         Raises:
             CorrespondenceError: another number of vertices than the model's.
-            InputError: values that are infinite, or hardly a vertex observed.
+            InputError: values that are infinite, or hardly any vertex is observed.
         """
         shape = without_estimates(shape) if isinstance(shape, Mesh) else shape
         vertices = shape.vertices if isinstance(shape, Mesh) else np.asarray(shape, dtype=np.float64)
@@ -371,16 +374,16 @@ class ShapeModel:
             name = shape.name if isinstance(shape, Mesh) else "The shape"
             raise CorrespondenceError(
                 f"{name} has {len(vertices)} vertices but the model has {self.n_vertices}; only shapes in the "
-                "model's vertex order can be projected, so fit this one instead (shapespace fit, or fit_scan)."
+                "model's vertex order can be projected; fit this one instead (shapespace fit, or fit_scan)."
             )
         is_observed: BoolArray = ~np.logical_or.reduce(np.isnan(vertices), axis=1)
         if np.isinf(vertices).any() or is_observed.sum() < _FEWEST_OBSERVED:
-            raise InputError("A shape to be projected must be finite, but for missing vertices (nan).")
+            raise InputError("A shape to be projected must be finite, except for missing vertices (nan).")
         if not align:
             return self.nearest(vertices)
         b, Q = np.zeros(self.n_modes), self.mean_vertices
         for _ in range(_PROJECTION_ITERATIONS):
-            # Phase 2 with known matches: pose and coefficients in turn, since modes may hold a little pose.
+            # Phase 2 with known matches: pose and coefficients alternate, since modes may contain a part of a pose.
             T_shape_model = fit_similarity(Q[is_observed], vertices[is_observed], with_scale=self.gauge == "shape")
             before, b = b, self.nearest(T_shape_model.inverse().apply(vertices))
             if np.abs(b - before).max() <= _PROJECTION_TOLERANCE * self.stddev[0]:
@@ -391,13 +394,13 @@ class ShapeModel:
     def nearest(self, vertices: FloatArray, modes: int | None = None, noise: float | None = None) -> FloatArray:
         """Return the coefficients (k,), mm, of the shape of the first modes that is nearest to vertices (V, 3).
 
-        Where some are missing, they are the likeliest by the others, b = (P^T P + s / variance)^-1 P^T y, since the
-        nearest shape could have anything elsewhere.
+        If some are missing, these are the likeliest given the others, b = (P^T P + s / variance)^-1 P^T y, since the
+        nearest shape would not determine the missing part.
 
         Args:
-            vertices: in the model's frame, mm; not-a-number where missing.
-            modes: k; None for all.
-            noise: s, mm^2, the variance of a coordinate that the modes leave over; None for `noise_variance`.
+            vertices: (V, 3) vertices in the model's frame, mm; not-a-number where missing.
+            modes: k, the number of modes; None for all.
+            noise: s, the variance of a coordinate outside the modes, mm^2; None for `noise_variance`.
         """
         off, modes_used = vertices - self.mean_vertices, self._vertex_modes[:modes]
         is_observed: BoolArray = ~np.logical_or.reduce(np.isnan(vertices), axis=1)
@@ -434,7 +437,7 @@ class ShapeModel:
             rng: generator, or a seed.
 
         Raises:
-            InputError: neither a generator nor a seed from 0, or no number of shapes.
+            InputError: `rng` is neither a generator nor a seed from 0, or `count` is not a number of shapes.
         """
         if not isinstance(count, int | np.integer) or count < 0:  # pyright: ignore[reportUnnecessaryIsInstance]
             raise InputError(f"ShapeModel.sample takes a number of shapes, not {count!r}.")
@@ -442,7 +445,7 @@ class ShapeModel:
         return rng.standard_normal((count, self.n_modes)) * self.stddev
 
     def truncate(self, modes: int) -> ShapeModel:
-        """Return the model with its first `modes` modes; what they leave over joins `noise_variance`.
+        """Return the model with its first `modes` modes; the variance of the others is added to `noise_variance`.
 
         Raises:
             InputError: fewer than one, or more than the model has.
@@ -457,7 +460,7 @@ class ShapeModel:
 
     @cached_property
     def with_all_modes(self) -> ShapeModel:
-        """The model of the vertices with all modes of its training shapes; itself where it has no others."""
+        """The model of the vertices with all modes of its training shapes; the model itself if it has no others."""
         training = self.training
         if training is None or not training.rest.shape[1]:
             return self
@@ -470,13 +473,13 @@ class ShapeModel:
         )  # fmt: skip
 
     def fields(self) -> model_file.ModelFields:
-        """Return what the model is made of, by the names of its arguments."""
+        """Return the data of the model by the names of its arguments."""
         plain = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         coding = {name: array for name, array in self.coding.items() if name != _VECTOR}
         return {**plain, "mean": self._vector, "coding": coding}
 
     def save(self, path: Path | str) -> None:
-        """Write the model to one HDF5 file, whole or not at all.
+        """Write the model to one HDF5 file, completely or not at all.
 
         Raises:
             FileError: the folder cannot be written, or the disk is full.
@@ -488,19 +491,19 @@ class ShapeModel:
     def load(cls, path: Path | str) -> ShapeModel:
         """Read a model written by `save`, checking its hashes, or one in a format of another tool.
 
-        Where such a file parts identity and expression, both together are the model; `AdditiveModel.load` parts them.
+        If such a file separates identity and expression, the model contains both; `AdditiveModel.load` separates them.
 
         Raises:
-            FileError: it cannot be read.
-            ModelFileError: it is damaged, of another version, or not a model.
-            InputError: the argument is no path.
+            FileError: the file cannot be read.
+            ModelFileError: the file is damaged, of another version, or not a model.
+            InputError: the argument is not a path.
         """
         require_path(path, "ShapeModel.load")
         if is_foreign(Path(path)):
             return cls.of_foreign(load_foreign(Path(path)), Path(path))
         fields = model_file.load(Path(path))
         try:
-            with np.errstate(all="ignore"):  # huge numbers overflow on the way to being refused
+            with np.errstate(all="ignore"):  # huge numbers overflow before they are rejected
                 model = cls(**fields)
         except InputError as error:
             message = str(error)[:_TOLD]
@@ -512,10 +515,10 @@ class ShapeModel:
 
     @classmethod
     def of_foreign(cls, foreign: Foreign, path: Path) -> ShapeModel:
-        """Return the model that `path` of another tool holds.
+        """Return the model in the file `path` of another tool.
 
         Raises:
-            ModelFileError: its parts do not make a model.
+            ModelFileError: the parts do not make a model.
         """
         try:
             return cls(**foreign.fields)
@@ -526,9 +529,9 @@ class ShapeModel:
         """Return a matplotlib figure of the model.
 
         Args:
-            what: `modes`, the first ones at minus and plus 3 standard deviations; `mean`, from three sides; or
+            what: `modes`, the first modes at minus and plus 3 standard deviations; `mean`, from three sides; or
                 `spectrum`, the share of the variance by the number of modes.
-            options: of that figure's function in `shapespace.report.figures`, such as `modes=8`.
+            options: options of the figure's function in `shapespace.report.figures`, such as `modes=8`.
 
         Raises:
             InputError: there is no such plot.
@@ -537,10 +540,10 @@ class ShapeModel:
         return lazy_import("plot_model")(self, what, **options)
 
     def view(self, *, height_px: int = 720) -> OpenViewer:
-        """Open the viewer on the model, in a notebook in the cell's own frame; see `FitResult.view`.
+        """Open the viewer on the model; in a notebook, in the frame of the cell; see `FitResult.view`.
 
         Args:
-            height_px: of the frame.
+            height_px: height of the frame, pixels.
 
         Raises:
             ShapespaceError: the extra `view` is not installed.
@@ -551,7 +554,7 @@ class ShapeModel:
         return lazy_import("html_of_model")(self)
 
     def as_linear(self) -> LinearModel:
-        """Return what formats of other tools can hold of the model."""
+        """Return the part of the model that formats of other tools can represent."""
         return as_linear(self.fields(), self.mean_vertices, self.vertex_basis)
 
     def _coefficients(self, b: npt.ArrayLike) -> FloatArray:
@@ -564,10 +567,10 @@ class ShapeModel:
 
 
 def region_vertices(vertices: npt.ArrayLike, n_vertices: int, name: str) -> IntArray:
-    """Return the vertices of a region, (n,) int32, each once, in order; `name` is what errors call it.
+    """Return the vertices of a region, (n,) int32, each once, in order; `name` is its name in messages.
 
     Raises:
-        InputError: there are none, or one that a model of `n_vertices` does not have.
+        InputError: the region is empty, or has a vertex that a model of `n_vertices` does not have.
     """
     unique = np.unique(np.asarray(vertices, dtype=np.int64))
     if unique.ndim != 1 or not len(unique) or unique[0] < 0 or unique[-1] >= n_vertices:
@@ -580,16 +583,16 @@ def region_vertices(vertices: npt.ArrayLike, n_vertices: int, name: str) -> IntA
 
 
 def odd_size_notes(mean: FloatArray) -> list[str]:
-    """Return that a mean shape (V, 3), mm, is of a size that tells of another unit, in a sentence, if it is."""
+    """Return a note if the size of a mean shape (V, 3), mm, suggests another unit, else no note."""
     extent = np.ptp(mean, axis=0)
     if _LEAST_MM < float(extent.max()) < _MOST_MM:
         return []
     size = " x ".join(f"{length:.3g}" for length in extent)
-    return [f"The mean is {size} mm large, which is odd for mm; --unit says in which unit the meshes are."]
+    return [f"The mean is {size} mm large, which is unusual for mm; set the unit of the meshes with --unit."]
 
 
-def _refuse_impossible(stddev: FloatArray, mean_vertices: FloatArray, first_mode: int = 0) -> None:
-    """Refuse modes that vary by less than the vertices are rounded to, or by far more than the shape is large."""
+def _check_stddev(stddev: FloatArray, mean_vertices: FloatArray, first_mode: int = 0) -> None:
+    """Raise if a mode varies by less than the rounding of the vertices, or far more than the size of the shape."""
     norm = float(np.linalg.norm(mean_vertices - mean_vertices.mean(axis=0)))
     if norm == 0.0 or not len(stddev):
         return
@@ -597,7 +600,7 @@ def _refuse_impossible(stddev: FloatArray, mean_vertices: FloatArray, first_mode
         if value < _ROUNDING * norm:
             raise InputError(
                 f"Mode {first_mode + mode + 1} of the model has a standard deviation of {value:.1e} mm, which is less "
-                "than the rounding of its vertices; leave such modes out."
+                "than the rounding of its vertices; omit such modes."
             )
         if value > _WIDEST * norm:
             raise InputError(

@@ -1,6 +1,6 @@
-"""Shapes that do not fit into memory, made ready for PCA: read one by one, aligned by passes over one file.
+"""Shapes that do not fit into memory, prepared for PCA: read one by one, aligned by passes over one file.
 
-The file holds each shape as its difference from a template, in single precision: first in a pose near that of the
+The file contains each shape as its difference from a template, in single precision: first in a pose near that of the
 template, then, when the poses are known, aligned and about the mean. Nothing else grows with the number of shapes but
 the poses, 96 bytes each.
 """
@@ -37,7 +37,7 @@ from shapespace.io.containers.archives import kept_arrays, write_arrays
 from shapespace.io.containers.row_spill import Spill
 from shapespace.io.files import make_folder, remove_file, sha256_of_file, write_error, write_text
 from shapespace.io.memory_cache import available_bytes
-from shapespace.model.choose_modes import drawn, number_of_modes, rounding_mm
+from shapespace.model.choose_modes import number_of_modes, rounding_mm, sample_shapes
 from shapespace.model.pca import ALL_EQUAL, Modes, PrincipalComponents, checked_large_modes, principal_components
 from shapespace.model.training_shapes import TrainingShapes
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, common_faces
@@ -54,7 +54,7 @@ _ROUNDING = 64 * float(np.finfo(float).eps)
 
 
 class Meshes(Protocol):
-    """Meshes that may be loaded when they are asked for: a list, or anything with a length and an item."""
+    """Meshes that may be loaded on access: a list, or any object with a length and items."""
 
     def __len__(self) -> int: ...
 
@@ -63,11 +63,11 @@ class Meshes(Protocol):
 
 @dataclass(frozen=True)
 class Scratch:
-    """Where a build keeps what it would need to go on after it is killed; the folder vanishes when it is done.
+    """Folder with the data from which a build that was killed continues; it is removed when the build is finished.
 
     Args:
-        folder: of this build alone.
-        identity: of the meshes and settings; what is kept of another one is dropped.
+        folder: working folder, used by one build only.
+        identity: identity of the meshes and settings; kept data of another identity are removed.
     """
 
     folder: Path
@@ -76,20 +76,20 @@ class Scratch:
 
 @dataclass(frozen=True, eq=False)
 class KeptShapes:
-    """The aligned shapes of a model, beside its file, to which others can be added.
+    """The aligned shapes of a model, next to its file, to which others can be added.
 
     Args:
-        folder: that holds them.
-        model_hash: of that model.
+        folder: folder of the shapes.
+        model_hash: content hash of the model.
         digest: SHA-256 of the file of shapes.
-        faces: (F, 3) of the shapes, or None.
+        faces: (F, 3) triangles of the shapes, or None.
         template: (V, 3) mm; the shapes are stored as differences from it.
         reference: (V, 3) mm, whose orientation is the frame.
-        sizes: (N,) centroid sizes of the meshes as they were given, mm.
-        gauge: of the model.
-        align: whether they were aligned.
-        alignment_vertices: that carried the alignment, or None for all.
-        rounding: of the first mesh, mm.
+        sizes: (N,) centroid sizes of the given meshes, mm.
+        gauge: gauge of the model.
+        align: whether the shapes were aligned.
+        alignment_vertices: indices of the vertices that determined the alignment, or None for all.
+        rounding: rounding of the first mesh, mm.
     """
 
     folder: Path
@@ -106,11 +106,11 @@ class KeptShapes:
 
     @staticmethod
     def load(folder: Path) -> KeptShapes:
-        """Return what a build kept in `folder`.
+        """Return the shapes that a build kept in `folder`.
 
         Raises:
-            FileError: there is nothing.
-            FileFormatError: it is damaged.
+            FileError: there are no shapes.
+            FileFormatError: the data are damaged.
         """
         path = folder / _KEPT
         if not path.is_file():
@@ -143,7 +143,7 @@ class KeptShapes:
             ) from error
 
     def save(self) -> None:
-        """Write all but the shapes themselves to `folder`.
+        """Write all data except the shapes themselves to `folder`.
 
         Raises:
             FileError: the disk is full.
@@ -155,7 +155,7 @@ class KeptShapes:
         write_arrays(self.folder / _KEPT, {**arrays, **there, "header": np.array(json.dumps(header))})
 
     def check(self) -> None:
-        """Refuse shapes that have changed since they were kept.
+        """Raise if the shapes have changed since they were kept.
 
         Raises:
             FileError: they cannot be read.
@@ -172,40 +172,40 @@ class KeptShapes:
 
         Raises:
             FileError: they cannot be read.
-            FileFormatError: they are cut short.
+            FileFormatError: the file is truncated.
         """
         return Spill(self.folder / _SHAPES, len(self.sizes), self.template.size, new=False)
 
 
 @dataclass(frozen=True, eq=False)
-class Aligned:
-    """Aligned shapes on the disk, and what is known of them.
+class AlignedShapes:
+    """Aligned shapes on the disk, with their poses and settings.
 
     Args:
         shapes: N rows of 3V numbers about `training.template`.
         training: the other data of the shapes; its folder and model are not yet set.
-        passes: folder where those of the PCA are kept; None keeps nothing.
+        passes: folder where the passes of the PCA are kept; None keeps nothing.
     """
 
     shapes: Spill
     training: KeptShapes
     passes: Path | None
 
-    def components(self, modes: Modes, seed: int, tell: Tell) -> PrincipalComponents:
+    def components(self, modes: Modes, seed: int, log: Tell) -> PrincipalComponents:
         """Return mean and modes, as `principal_components` does of shapes in memory.
 
         Raises:
-            InputError: as `principal_components`, or too few shapes to choose the number of modes.
+            InputError: see `principal_components`, or there are too few shapes to choose the number of modes.
         """
         if modes == "auto":
-            tell("choosing the number of modes")
-            modes = number_of_modes(modes, _sample(self.shapes, seed), seed)
+            log("choosing the number of modes")
+            modes = number_of_modes(modes, _sample_shapes(self.shapes, seed), seed)
         pc = principal_components(
             self.shapes,
             modes,
             seed=seed,
             passes=self.passes,
-            on_pass=lambda n, share: tell(f"finding the modes, pass {n} (residual {share:.0e} of the first)"),
+            on_pass=lambda n, share: log(f"finding the modes, pass {n} (residual {share:.0e} of the first)"),
         )
         return replace(pc, mean=pc.mean + self.training.template.reshape(-1))
 
@@ -223,10 +223,10 @@ class Aligned:
         return sizes
 
     def keep(self, folder: Path, model_hash: str) -> None:
-        """Move the shapes to `folder`, for later shapes to be added to theirs.
+        """Move the shapes to `folder`, so that later shapes can be added to them.
 
         Raises:
-            FileError: it cannot be written.
+            FileError: the folder cannot be written.
         """
         make_folder(folder)
         remove_file(folder / _KEPT)
@@ -240,11 +240,11 @@ class Aligned:
 
 
 def bytes_in_memory(count: int, mesh: Mesh, *, choose: bool) -> int:
-    """Return about how many bytes a model of `count` meshes like this one takes while it is made in memory.
+    """Return the approximate number of bytes to build a model of `count` such meshes in memory.
 
     Args:
         count: N.
-        mesh: one of them.
+        mesh: one of the meshes.
         choose: whether the number of modes is chosen by cross-validation.
     """
     vertices = (_COPIES_TO_CHOOSE if choose else _COPIES) * mesh.vertices.nbytes
@@ -253,15 +253,15 @@ def bytes_in_memory(count: int, mesh: Mesh, *, choose: bool) -> int:
 
 
 def streaming_note(meshes: Meshes, *, modes: Modes, out_of_core: bool | None) -> str:
-    """Return why meshes that nobody asked to stream must be streamed, in a sentence; empty if they fit into memory."""
+    """Return why meshes must be streamed, although not requested, in a sentence; empty if they fit into memory."""
     if out_of_core is not None or len(meshes) < 2:
         return ""
     needed, free = bytes_in_memory(len(meshes), meshes[0], choose=modes == "auto"), available_bytes()
     if free is None or needed <= _MOST_OF_MEMORY * free:
         return ""
     return (
-        f"{len(meshes)} meshes would take {needed / 1e9:.1f} GB of memory, which is more than four fifths of what is "
-        "free, so they are streamed through a file (--out-of-core)."
+        f"{len(meshes)} meshes would take {needed / 1e9:.1f} GB of memory, more than four fifths of the free "
+        "memory, so they are streamed through a file (--out-of-core)."
     )
 
 
@@ -275,79 +275,80 @@ def aligned_on_disk(
     scratch: Scratch | None,
     onto: KeptShapes | None,
     modes: Modes,
-    tell: Tell,
-) -> Generator[Aligned]:
-    """Yield the shapes of `meshes`, and before them those of `onto`, aligned in a file that vanishes with the block.
+    log: Tell,
+) -> Generator[AlignedShapes]:
+    """Yield the shapes of `meshes`, and before them those of `onto`, aligned in a file that is removed with the block.
 
     Args:
-        meshes: whole, one corresponding to the other.
-        gauge: as of `align_in_place`.
-        align: False takes them as they stand.
-        alignment_vertices: as of `align_in_place`.
-        scratch: for what a build that is killed goes on with; None takes a temporary folder and keeps nothing.
-        onto: shapes to which these are added.
-        modes: that will be asked for; what cannot be had is refused before anything is read.
-        tell: called with the current step.
+        meshes: complete meshes in correspondence.
+        gauge: whether size is kept or removed, see `align_in_place`.
+        align: whether to align the meshes; False uses their given poses.
+        alignment_vertices: vertices that determine the alignment, see `align_in_place`.
+        scratch: folder for the data from which a build that was killed continues; None takes a temporary folder and
+            keeps nothing.
+        onto: shapes to which the new ones are added.
+        modes: modes that will be computed; an impossible number raises before any mesh is read.
+        log: function called with the current step.
 
     Raises:
         CorrespondenceError: the meshes differ in vertices or triangles.
         InputError: missing vertices, values that are not finite, no variation, or too few meshes.
         FileError: a mesh cannot be read, the disk is full, or another build uses the folder.
     """
-    with _folder(scratch) as folder:
-        work = _Work(folder, meshes, gauge, align, alignment_vertices, onto=onto, tell=tell)
+    with _open_folder(scratch) as folder:
+        work = _Work(folder, meshes, gauge, align, alignment_vertices, onto=onto, log=log)
         if modes != "auto":
             checked_large_modes(modes, work.count, work.first.vertices.size)
         path = folder / _SHAPES
         try:
             with work.aligned() as (shapes, training):
-                yield Aligned(shapes, training, None if scratch is None else folder)
+                yield AlignedShapes(shapes, training, None if scratch is None else folder)
         finally:
             path.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
-def _folder(scratch: Scratch | None) -> Generator[Path]:
+def _open_folder(scratch: Scratch | None) -> Generator[Path]:
     if scratch is None:
         with tempfile.TemporaryDirectory(prefix="shapespace-") as name:
             yield Path(name)
         return
     folder = make_folder(scratch.folder)
-    with _only_one(folder):
+    with _lock_folder(folder):
         identity = folder / _IDENTITY
         if not identity.is_file() or identity.read_text("utf-8", "replace") != scratch.identity:
-            _empty(folder)
+            _empty_folder(folder)
             write_text(identity, scratch.identity)
         try:
             yield folder
         except InputError:
-            _remove(folder)
+            _remove_folder(folder)
             raise
         except BaseException:
-            # Without a pose or a pass there is nothing to go on with.
+            # Without a pose or a pass there is nothing to continue with.
             if not (folder / _POSES).is_file():
-                _remove(folder)
+                _remove_folder(folder)
             raise
-        _remove(folder)
+        _remove_folder(folder)
 
 
-def _remove(folder: Path) -> None:
-    _empty(folder)
+def _remove_folder(folder: Path) -> None:
+    _empty_folder(folder)
     with contextlib.suppress(OSError):
         (folder / _LOCK).unlink()
         folder.rmdir()
 
 
-def _empty(folder: Path) -> None:
+def _empty_folder(folder: Path) -> None:
     for file in folder.iterdir():
         if file.name != _LOCK:
             file.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
-def _only_one(folder: Path) -> Generator[None]:
-    """Hold the folder for this process; the system lets go of it whatever ends the process."""
-    if os.name == "nt":  # Windows refuses to remove open files, which does as well
+def _lock_folder(folder: Path) -> Generator[None]:
+    """Lock the folder for this process; the system releases the lock even if the process is killed."""
+    if os.name == "nt":  # Windows does not remove open files, which has the same effect
         yield
         return
     with (folder / _LOCK).open("w") as stream:
@@ -355,12 +356,12 @@ def _only_one(folder: Path) -> Generator[None]:
         with contextlib.suppress(OSError):  # a file system without locks
             is_free = lock_descriptor(stream.fileno(), blocking=False)
         if not is_free:
-            raise FileError(f"Another build is at work in {folder}; wait for it, or give another name for the model.")
+            raise FileError(f"Another build is running in {folder}; wait for it, or give another name for the model.")
         yield
 
 
 class _Work:
-    """One build: what is read of the meshes, where it stands, and the poses that it comes to."""
+    """One build: the data read from the meshes, its progress, and the resulting poses."""
 
     def __init__(
         self,
@@ -370,13 +371,11 @@ class _Work:
         align: bool,
         alignment_vertices: IntArray | None,
         onto: KeptShapes | None,
-        tell: Tell,
+        log: Tell,
     ) -> None:
         if len(meshes) + (0 if onto is None else len(onto.sizes)) < 2:
-            raise InputError(
-                f"A shape model needs at least two meshes, not {len(meshes)}; with one there is nothing that varies."
-            )
-        self.folder, self.meshes, self.onto, self.tell = folder, meshes, onto, tell
+            raise InputError(f"A shape model needs at least two meshes, not {len(meshes)}; one mesh has no variation.")
+        self.folder, self.meshes, self.onto, self.log = folder, meshes, onto, log
         self.before = 0 if onto is None else len(onto.sizes)
         self.count = self.before + len(meshes)
         self.first = meshes[0] if onto is None else Mesh(onto.template, onto.faces, name="the model")
@@ -390,40 +389,40 @@ class _Work:
 
     @contextlib.contextmanager
     def aligned(self) -> Generator[tuple[Spill, KeptShapes]]:
-        """Yield the file of aligned shapes, and the data of the shapes: as a killed build left it, or made anew."""
+        """Yield the file of aligned shapes, and the data of the shapes: left by a killed build, or computed."""
         path, start, done = (self.folder / name for name in (_SHAPES, _START, _ALIGNED))
         poses = kept_arrays(self.folder / _POSES)
         complete = path.is_file() and path.stat().st_size == 4 * self.count * self.first.vertices.size
         near = kept_arrays(start) if complete else None
         if complete and done.is_file() and poses is not None:
             with Spill(path, self.count, self.first.vertices.size, new=False) as shapes:
-                yield shapes, self._about(poses)
+                yield shapes, self._kept_shapes(poses)
             return
         remove_file(done)
         with Spill(path, self.count, self.first.vertices.size, new=near is None) as shapes:
             if near is None:
                 remove_file(start)
-                near = self._read(shapes)
+                near = self._read_shapes(shapes)
                 shapes.to_disk()
                 write_arrays(start, near)
             if poses is None:
-                poses = self._posed(shapes, near)
+                poses = self._find_poses(shapes, near)
                 write_arrays(self.folder / _POSES, poses)
-            # From here on the file is neither as read nor aligned, until it is.
+            # Until the alignment is finished, the file is neither as read nor aligned.
             remove_file(start)
-            self._move(shapes, near["template"], poses)
+            self._move_shapes(shapes, near["template"], poses)
             shapes.to_disk()
             write_text(done, "")
-            yield shapes, self._about(poses)
+            yield shapes, self._kept_shapes(poses)
 
-    def _about(self, poses: dict[str, npt.NDArray[Any]]) -> KeptShapes:
+    def _kept_shapes(self, poses: dict[str, npt.NDArray[Any]]) -> KeptShapes:
         return replace(
             self.training, folder=self.folder, model_hash="", digest="", template=poses["template"],
             sizes=poses["sizes"],
         )  # fmt: skip
 
-    def _read(self, shapes: Spill) -> dict[str, npt.NDArray[Any]]:
-        """Fill the file with shapes in poses near the template's, and return what is known of them."""
+    def _read_shapes(self, shapes: Spill) -> dict[str, npt.NDArray[Any]]:
+        """Fill the file with shapes in poses near the template's, and return their poses and sizes."""
         if self.onto is None:
             x = self.first.vertices
             template = x - x[self.chosen].mean(axis=0) if self.training.align else x
@@ -443,7 +442,7 @@ class _Work:
             posed[index] = centroid_size(vertices[self.chosen])
             return vertices - template
 
-        self._fill(shapes, near)
+        self._fill_rows(shapes, near)
         largest = max((float(np.abs(bound).max()) for bound in bounds), default=0.0)
         if self.onto is None and (not bounds or float((bounds[1] - bounds[0]).max()) <= _ROUNDING * largest):
             raise InputError(ALL_EQUAL)
@@ -451,15 +450,15 @@ class _Work:
             sizes[: self.before] = self.onto.sizes
         return {"template": template, "sizes": sizes, "posed": posed}
 
-    def _fill(self, shapes: Spill, row: Callable[[int, FloatArray], FloatArray]) -> None:
+    def _fill_rows(self, shapes: Spill, row: Callable[[int, FloatArray], FloatArray]) -> None:
         block = np.empty((shapes.block_rows, shapes.columns))
         for start in range(0, self.count, len(block)):
             stop = min(start + len(block), self.count)
-            for index, vertices in self._shapes(start, stop):
+            for index, vertices in self._load_shapes(start, stop):
                 block[index - start] = row(index, vertices).reshape(-1)
             shapes.write_rows(start, block[: stop - start])
 
-    def _shapes(self, start: int, stop: int) -> Iterator[tuple[int, FloatArray]]:
+    def _load_shapes(self, start: int, stop: int) -> Iterator[tuple[int, FloatArray]]:
         """Yield (index, vertices (V, 3)) of shapes, checked."""
         if self.onto is not None and start < self.before:
             with self.onto.opened() as old:
@@ -467,15 +466,15 @@ class _Work:
             yield from enumerate(rows.reshape(len(rows), -1, 3) + self.onto.template, start)
         for index in range(max(start, self.before), stop):
             if index % _TOLD_EVERY == 0:
-                self.tell(f"reading mesh {index - self.before + 1} of {len(self.meshes)}")
+                self.log(f"reading mesh {index - self.before + 1} of {len(self.meshes)}")
             mesh = without_estimates(self.meshes[index - self.before])
             common_faces((self.first, mesh))
-            _refuse_holes(mesh)
+            _check_complete(mesh)
             if self.training.align:
-                refuse_without_extent(mesh.vertices, mesh.name)
+                check_extent(mesh.vertices, mesh.name)
             yield index, mesh.vertices
 
-    def _posed(self, shapes: Spill, near: dict[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
+    def _find_poses(self, shapes: Spill, near: dict[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
         """Return the poses of the shapes in the file, and their mean."""
         template: FloatArray = near["template"]
         poses = Poses(np.broadcast_to(np.eye(3), (self.count, 3, 3)).copy(), np.zeros((self.count, 3)))
@@ -487,11 +486,11 @@ class _Work:
                 size=float(near["sizes"].mean()),
                 reference=self.training.reference,
                 alignment_vertices=self.training.alignment_vertices,
-                on_iteration=lambda n, moved: self.tell(f"aligning, round {n} (the mean moved by {moved:.1e} mm)"),
+                on_iteration=lambda n, moved: self.log(f"aligning, round {n} (the mean moved by {moved:.1e} mm)"),
             )
             mean = alignment.mean
             if self.training.gauge == "shape" and self.training.alignment_vertices is None:
-                self.tell("scaling to the tangent")
+                self.log("scaling to the tangent")
                 mean = scale_to_tangent_streamed(source, mean, poses)
         else:
             summed = np.zeros(shapes.columns)
@@ -500,7 +499,7 @@ class _Work:
             mean = template + summed.reshape(-1, 3) / self.count
         return {"template": mean, "sizes": near["sizes"], "linear": poses.linear, "offset": poses.offset}
 
-    def _move(self, shapes: Spill, near: FloatArray, poses: dict[str, npt.NDArray[Any]]) -> None:
+    def _move_shapes(self, shapes: Spill, near: FloatArray, poses: dict[str, npt.NDArray[Any]]) -> None:
         """Turn differences from the template `near` in the file into those of the posed shapes from their mean."""
         T = Poses(poses["linear"], poses["offset"])
         for start, block in shapes.row_blocks():
@@ -508,8 +507,8 @@ class _Work:
             shapes.write_rows(start, (T.apply(start, vertices) - poses["template"]).reshape(len(block), -1))
 
 
-def refuse_without_extent(vertices: FloatArray, name: str) -> None:
-    """Refuse a shape (V, 3), of which vertices may be missing, that determines no rotation.
+def check_extent(vertices: FloatArray, name: str) -> None:
+    """Raise if a shape (V, 3), of which vertices may be missing, does not determine a rotation.
 
     Raises:
         InputError: its vertices lie on a line or coincide.
@@ -518,24 +517,24 @@ def refuse_without_extent(vertices: FloatArray, name: str) -> None:
     centred = shape - shape.mean(axis=0)
     extent = np.linalg.eigvalsh(centred.T @ centred)
     if extent[1] <= 1e-9 * extent[2]:
-        raise InputError(f"{name}: its vertices lie on a line or coincide, so it cannot be aligned; leave it out.")
+        raise InputError(f"{name}: its vertices lie on a line or coincide, so it cannot be aligned; exclude this mesh.")
 
 
-def _refuse_holes(mesh: Mesh) -> None:
+def _check_complete(mesh: Mesh) -> None:
     missing: BoolArray = np.isnan(mesh.vertices)
     if missing.any():
         raise InputError(
-            f"{mesh.name}: vertices are missing, and meshes that are streamed from the disk must be whole; leave it "
-            "out, or build from fewer meshes in memory."
+            f"{mesh.name}: vertices are missing, and meshes that are streamed from the disk must be complete; exclude "
+            "it, or build from fewer meshes in memory."
         )
     if not (np.abs(mesh.vertices) < np.finfo(np.float32).max).all():
         raise InputError(
-            f"{mesh.name} holds vertices that are not finite; see shapespace check, and repair it or leave it out."
+            f"{mesh.name} has vertices that are not finite; see shapespace check, and repair or exclude this mesh."
         )
 
 
-def _sample(shapes: Spill, seed: int) -> FloatArray:
-    """Return shapes (n, 3v) to choose the number of modes by: all, or as many as are looked at, within a bound."""
-    rows = drawn(shapes.rows, seed)
+def _sample_shapes(shapes: Spill, seed: int) -> FloatArray:
+    """Return shapes (N, 3V) on which the number of modes is chosen: all, or a sample of bounded size."""
+    rows = sample_shapes(shapes.rows, seed)
     every = max(1, -(-8 * len(rows) * shapes.columns // _SAMPLE_BYTES))
     return np.stack([shapes.rows_from(row, row + 1).reshape(-1, 3)[::every].reshape(-1) for row in rows])

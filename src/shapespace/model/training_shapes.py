@@ -15,9 +15,9 @@ from shapespace.reprs import short_repr
 from shapespace.types import FloatArray, read_only, set_fields
 
 MOST_SHAPES = 500  # training shapes of a model file; of larger sets a fixed random subset, to bound size and time
-UNIT_TOLERANCE = 1e-3  # length of a mode off 1; float32 rounding over millions of coordinates is smaller
+UNIT_TOLERANCE = 1e-3  # difference of the length of a mode from 1; float32 rounding of many coordinates is smaller
 _SAME_SIZE = 1e-6  # spread of the logarithm of size; shapes that were scaled to one size have less
-_ROUNDING = 1e-6  # share of the total variance; modes with less are rounding
+_ROUNDING = 1e-6  # share of the total variance; modes with less are rounding errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,9 +65,10 @@ class TrainingShapes:
         """Return the coefficients of aligned shapes.
 
         Args:
-            shape: returns the vertices (V, 3) of a shape by its index.
-            sizes: (N,) of the shapes before alignment, relative to those after it; only those of `indices` are used.
-            mean: (V, 3) mm, of the model.
+            shape: function that returns the vertices (V, 3) of a shape by its index.
+            sizes: (N,) sizes of the shapes before alignment, relative to those after it; only those of `indices` are
+                used.
+            mean: (V, 3) mean of the model, mm.
             basis: (3V, K) orthonormal modes of the model.
         """
         index = TrainingShapes.indices(len(sizes))
@@ -80,7 +81,7 @@ class TrainingShapes:
         log_scale -= log_scale.mean()
         if total - float(np.vdot(b, b)) <= _ROUNDING * total:
             return TrainingShapes(b, np.zeros((mean.size, 0)), log_scale)
-        for row, own in zip(off, b, strict=True):  # one by one, to hold the shapes in memory once
+        for row, own in zip(off, b, strict=True):  # one by one, to have only one copy of the shapes in memory
             row -= basis @ own
         value, vector = eigh(off @ off.T)
         significant = np.flatnonzero(value > _ROUNDING * total)[::-1]

@@ -1,1 +1,1 @@
-"""Completion of partial shapes: the posterior of the whole shape given what a scan shows (docs/completion.md)."""
+"""Completion of partial shapes: the posterior of the complete shape given a partial scan (docs/completion.md)."""

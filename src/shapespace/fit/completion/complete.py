@@ -97,12 +97,13 @@ class CompletionConfig:
     """Settings of a completion.
 
     Args:
-        samples: number of samples of the whole shape.
+        samples: number of samples of the complete shape.
         part: region of the model that is estimated even where the scan shows it, such as a diseased or damaged part
             (default: none).
         mirror: `combined` also uses the mirror image of the observed side of a symmetric object, weighted by how well
-            sides predict each other; `alone` uses the mirror image instead of the model where there is one.
-        with_doubtful: complete scans whose fit is doubtful too (default: refuse them).
+            sides predict each other; `alone` uses the mirror image instead of the model wherever the mirrored side is
+            observed.
+        with_doubtful: complete scans whose fit is doubtful too (default: reject them).
         seed: seed of the samples.
         fit: settings of the fit.
 
@@ -123,7 +124,7 @@ class CompletionConfig:
         if self.mirror not in ("never", "combined", "alone"):
             raise InputError(f"There is no mirror {self.mirror!r}; choose one of never, combined, alone.")
         if self.fit.fitting.name != "robust" or self.fit.region is not None:
-            raise InputError("A completion needs a fit of the whole model by the robust method.")
+            raise InputError("A completion needs a fit of the complete model by the robust method.")
 
 
 @dataclass(frozen=True)
@@ -131,17 +132,16 @@ class QuantityEstimate:
     """A quantity of the completed shape.
 
     Args:
-        name: of the quantity.
-        unit: of its values, such as mm; empty for plain numbers.
-        value: of the completed surface.
-        mean: of its predictive distribution.
-        stddev: of that distribution.
+        name: name of the quantity.
+        unit: unit of the values, such as mm; empty for plain numbers.
+        value: value of the quantity on the completed surface.
+        mean: mean of the predictive distribution.
+        stddev: standard deviation of the predictive distribution.
         low: lower end of the interval.
         high: upper end of the interval.
         level: probability of the interval.
-        calibrated_on: number of training shapes left out in turn from which mean, standard deviation and interval are
-            estimated; 0 if they are those of the samples, and not calibrated.
-
+        calibrated_on: number of training shapes, each held out in turn, from which mean, standard deviation and
+            interval are estimated; 0 if they come from the samples and are not calibrated.
     Example:
         >>> completion = ss.complete(model, meshes[0], ss.CompletionConfig(samples=4))
         >>> width = completion.estimate(lambda mesh: float(np.ptp(mesh.vertices[:, 0])), "width", "mm")
@@ -165,19 +165,19 @@ class Completion:
     """A completed scan.
 
     Args:
-        fit: the fit that it is based on.
-        status: `converged` or `doubtful`,
-        reasons: and why.
+        fit: the fit that the completion is based on.
+        status: `converged` or `doubtful`.
+        reasons: reasons for the status.
         notes: sentences on the scan and the completion.
         config: settings.
-        vertices: (V, 3) of the completed surface in the frame and unit of the scan.
+        vertices: (V, 3) vertices of the completed surface in the frame and unit of the scan.
         knowledge: (V,) int32 code of each vertex in `KNOWLEDGE`.
         stddev_mm: (V,) standard deviation of the position of each vertex, mm of the scan: the root of the sum of the
             variances along three axes.
         posterior: joint distribution of pose, coefficients and off-model variation.
         T_scan_model: pose of the posterior, from the model's frame (mm) to the frame and unit of the scan.
-        calibration: completions of the training shapes by models of the others, from which intervals, skill and status
-            are estimated; None if the model neither contains nor counts its training shapes.
+        calibration: completions of the training shapes, each by a model of the other shapes, from which intervals,
+            skill and status are estimated; None if the model neither contains nor counts its training shapes.
 
     Example:
         >>> completion = ss.complete(model, meshes[0], ss.CompletionConfig(samples=4))
@@ -212,7 +212,7 @@ class Completion:
 
     @property
     def reason(self) -> str:
-        """One sentence on why it has its status."""
+        """One sentence that explains the status."""
         return sentence_of(self.status, self.reasons)
 
     @property
@@ -225,7 +225,9 @@ class Completion:
         return self._mesh(self.vertices, self.observed)
 
     def draw_samples(self, count: int | None = None) -> Float32Array:
-        """Return (count, V, 3) float32 whole shapes, in the frame and unit of the scan; None for `config.samples` (E6).
+        """Return (count, V, 3) float32 complete shapes in the frame and unit of the scan (E6).
+
+        `count` is None for `config.samples`.
 
         The same seed and count give the same samples.
         """
@@ -240,15 +242,16 @@ class Completion:
         """Return the distribution of a function of the shape.
 
         Args:
-            function: takes the mesh of a whole shape in the frame and unit of the scan, and returns a number.
-            name: of the quantity.
-            unit: of its values.
+            function: function of the mesh of a complete shape, in the frame and unit of the scan, that returns a
+                number.
+            name: name of the quantity.
+            unit: unit of the values.
             level: probability of the interval, between 0 and 1.
 
         Raises:
             InputError: a level outside 0 to 1, or values that are not finite.
         """
-        return self._estimates({(name, unit): function}, level)[0]
+        return self._estimate_quantities({(name, unit): function}, level)[0]
 
     def estimates(self, *, level: float = 0.95) -> tuple[QuantityEstimate, ...]:
         """Return the volume (of a closed model), area, length and centroid size.
@@ -263,14 +266,18 @@ class Completion:
         functions["area", "mm2"] = lambda mesh: float(face_areas(mesh).sum()) * mm**2
         functions["length", "mm"] = lambda mesh: float(np.ptp(mesh.vertices @ axis)) * mm
         functions["centroid size", "mm"] = lambda mesh: centroid_size(mesh.vertices) * mm
-        return self._estimates(functions, level)
+        return self._estimate_quantities(functions, level)
 
-    def _estimates(self, functions: Mapping[tuple[str, str], Function], level: float) -> tuple[QuantityEstimate, ...]:
+    def _estimate_quantities(
+        self, functions: Mapping[tuple[str, str], Function], level: float
+    ) -> tuple[QuantityEstimate, ...]:
         if not 0 < level < 1:
             raise InputError(f"The probability of an interval lies between 0 and 1, not {level:g}.")
-        return tuple(self._quantity(function, name, unit, level) for (name, unit), function in functions.items())
+        return tuple(
+            self._estimate_quantity(function, name, unit, level) for (name, unit), function in functions.items()
+        )
 
-    def _quantity(self, function: Function, name: str, unit: str, level: float) -> QuantityEstimate:
+    def _estimate_quantity(self, function: Function, name: str, unit: str, level: float) -> QuantityEstimate:
         def of(vertices: FloatArray) -> float:
             value = float(function(self._mesh(np.asarray(vertices, dtype=np.float64))))
             if not np.isfinite(value):
@@ -315,19 +322,19 @@ def complete(
     landmarks: Mapping[str, FloatArray] | str | PathLike[str] | None = None,
     T_scan_model: Similarity | None = None,
 ) -> Completion:
-    """Complete a partial scan, with the distribution of what it does not show.
+    """Complete a partial scan: its surface, and the distribution of the missing parts.
 
     Args:
-        model: the shape space, or the path of its file.
+        model: the shape model, or the path of its file.
         scan: a mesh or point cloud, in its own frame and unit, or its path.
         config: settings; None for the defaults.
-        landmarks: as of `fit_scan`; they may lie on missing parts.
-        T_scan_model: a start, as of `fit_scan`.
+        landmarks: landmarks of the scan, see `fit_scan`; they may lie on missing parts.
+        T_scan_model: initial pose, see `fit_scan`.
 
     Raises:
         FitError: too little of the scan matches, or its fit is doubtful.
-        InputError: a model without triangles or of fewer than five shapes, no such region, or a mirror image of a
-            model that is not symmetric.
+        InputError: the model has no triangles or fewer than five training shapes, it has no such region, or a mirror
+            image is requested of a model that is not symmetric.
     """
     config = config or CompletionConfig()
     model = model if isinstance(model, ShapeModel) else ShapeModel.load(Path(model))
@@ -340,7 +347,7 @@ def complete(
     model = model.with_all_modes
     if config.part is not None:
         fit = fit_scan(
-            model, _without_part(fit, config.part), config.fit, landmarks=landmarks, T_scan_model=T_scan_model
+            model, _remove_part(fit, config.part), config.fit, landmarks=landmarks, T_scan_model=T_scan_model
         )
     T_mm_scan = mm_frame(fit.scan, fit.mm_per_scan_unit)
     target = ScanTarget(fit.scan.with_vertices(T_mm_scan.apply(fit.scan.vertices)))
@@ -366,7 +373,7 @@ def complete(
     stands_out = evidence.start_score_mm < _STANDS_OUT * evidence.start_runner_up_score_mm
     is_sure = fit.status != "doubtful" and evidence.seen_share > (_SURE / 2 if stands_out else _SURE)
     if not landmarks and T_scan_model is None and not is_sure:
-        fit, apart_mm = _likeliest_pose(
+        fit, apart_mm = _find_likeliest_pose(
             fit, target, T_mm_scan.inverse(), config, lambda fit: posterior_at(fit, calibrated=False)
         )
     posterior = posterior_at(fit)
@@ -377,8 +384,8 @@ def complete(
     if config.part is not None:
         observed[Part.of(model, config.part).inside] = False
     calibration = calibrate(posterior, model, ~observed)
-    status, reasons = _judged(fit, posterior, calibration, dense.noise_mm, apart_mm, config)
-    notes = [*fit.notes, *_notes(model, fit, observed, with_scale=with_scale)]
+    status, reasons = _judge_completion(fit, posterior, calibration, dense.noise_mm, apart_mm, config)
+    notes = [*fit.notes, *_describe_missing_parts(model, fit, observed, with_scale=with_scale)]
     completed = T.inverse().apply(dense.vertices_scan_mm)
     variance = np.einsum("vii->v", posterior.vertex_covariance())
     if calibration is None:
@@ -386,10 +393,10 @@ def complete(
     else:
         is_unknowable = calibration.skill <= 0
         if status == "converged" and not observed.all():
-            left_out = "training shapes" if calibration.of_training else "samples of the model"
+            held_out = "training shapes" if calibration.of_training else "samples of the model"
             notes.append(
-                f"For {calibration.n_nearer} of {len(calibration)} {left_out} left out in turn the completion is "
-                "nearer to the missing part than the mean shape is."
+                f"{calibration.n_nearer} of {len(calibration)} {held_out}, each held out in turn, have a completion "
+                "that is nearer to the missing part than the mean shape is."
             )
         weight = np.where(observed, 0.0, calibration.mean_weight)[:, None]
         pose = fit_similarity(model.mean_vertices[observed], completed[observed], with_scale=with_scale)
@@ -409,26 +416,26 @@ def complete(
     )  # fmt: skip
 
 
-def _likeliest_pose(
+def _find_likeliest_pose(
     fit: FitResult,
     target: ScanTarget,
     T_scan_mm: Similarity,
     config: CompletionConfig,
     posterior_at: Callable[[FitResult], ShapePosterior],
 ) -> tuple[FitResult, float | None]:
-    """Return the likeliest of the fits from all poses of the search (E9), and how far another likely one is from it.
+    """Return the likeliest of the fits from all poses of the search (E9), and its distance to another likely fit.
 
     A small part of an object fits a model in several poses.
 
     Args:
-        fit: from the best pose of the search.
+        fit: fit from the best pose of the search.
         target: the scan in its mm frame.
-        T_scan_mm: from that frame to the scan's.
+        T_scan_mm: transform from that mm frame to the scan's own frame.
         config: settings.
         posterior_at: returns the posterior at a fit.
 
     Returns:
-        The fit, and the RMS distance between its vertices and those of the other one, mm; None where there is none.
+        The fit, and the RMS distance of its vertices to those of the other fit, mm; None if no other fit is likely.
     """
     model, fits = fit.model, [fit]
     with_scale = config.fit.limits(model).with_scale
@@ -437,25 +444,25 @@ def _likeliest_pose(
         with suppress(FitError):
             fits.append(fit_scan(model, fit.scan, config.fit, T_scan_model=T_scan_mm @ other.T_scan_model))
     found: list[tuple[float, FitResult, FloatArray, float]] = []
-    for one in fits:
+    for candidate in fits:
         with suppress(FitError):
-            posterior = posterior_at(one)
+            posterior = posterior_at(candidate)
             vertices = posterior.T_scan_model.apply(posterior.surface.vertices)
-            found.append((posterior.log_density(), one, vertices, posterior.covered_mismatch_mm))
+            found.append((posterior.log_density(), candidate, vertices, posterior.covered_mismatch_mm))
     if not found:
         return fit, None
     found.sort(key=lambda one: -one[0])
     best = found[0]
     for density, _, vertices, mismatch_mm in found[1:]:
         apart_mm = float(np.sqrt(((vertices - best[2]) ** 2).sum(axis=1).mean()))
-        # Another pose that the scan is nearer to speaks against the likeliest one, whatever their densities are.
+        # Another pose with a smaller mismatch is evidence against the likeliest pose, whatever their densities are.
         is_likely = density > best[0] - AS_LIKELY or mismatch_mm < best[3]
         if is_likely and apart_mm > _OTHER_POSE * rms_size(best[2]):
             return best[1], apart_mm
     return best[1], None
 
 
-def _judged(
+def _judge_completion(
     fit: FitResult,
     posterior: ShapePosterior,
     calibration: SurfaceCalibration | None,
@@ -463,10 +470,10 @@ def _judged(
     apart_mm: float | None,
     config: CompletionConfig,
 ) -> tuple[Status, tuple[Reason, ...]]:
-    """Return status and reasons: doubts of the fit that no test of the completion replaces, then those of the tests.
+    """Return status and reasons: the doubts about the fit that no test replaces, then those of the tests.
 
     Raises:
-        FitError: there are reasons to doubt it, and `with_doubtful` is not set.
+        FitError: there are reasons to doubt the completion, and `with_doubtful` is not set.
     """
     tested = _OF_MISSING_PARTS if calibration is not None else _OF_MISSING_PARTS - _BY_TRAINING_SHAPES
     reasons = [reason for reason in fit.reasons if reason.code not in tested]
@@ -478,7 +485,7 @@ def _judged(
     if z2 > limit:
         doubts.append(Reason(ReasonCode.SHAPE_IMPLAUSIBLE, {"z_rms": float(np.sqrt(z2))}))
     if calibration is not None:
-        doubts += _doubts_by_training_shapes(posterior, calibration, noise_mm)
+        doubts += _find_doubts_by_training_shapes(posterior, calibration, noise_mm)
     elif (off_model := float(np.sqrt(posterior.amplitude))) > _MOST_OFF_MODEL:
         doubts.append(Reason(ReasonCode.SCAN_OFF_MODEL, {"off_model": off_model}))
     if not doubts:
@@ -494,10 +501,10 @@ def _judged(
     return "doubtful", tuple(doubts)
 
 
-def _doubts_by_training_shapes(
+def _find_doubts_by_training_shapes(
     posterior: ShapePosterior, calibration: SurfaceCalibration, noise_mm: float
 ) -> list[Reason]:
-    """Return in which respects the scan and its completion are unlike those of the left-out training shapes."""
+    """Return how the scan and its completion differ from those of the training shapes, each held out in turn."""
     doubts, scale = list[Reason](), posterior.T_scan_model.scale
     followed = posterior.followed
     along = np.einsum("nvd,vd->nv", calibration.mean_errors[:, followed], posterior.surface.normals[followed])
@@ -514,8 +521,8 @@ def _doubts_by_training_shapes(
     return doubts
 
 
-def _notes(model: ShapeModel, fit: FitResult, observed: BoolArray, *, with_scale: bool) -> list[str]:
-    """Return sentences on how much is missing.
+def _describe_missing_parts(model: ShapeModel, fit: FitResult, observed: BoolArray, *, with_scale: bool) -> list[str]:
+    """Return sentences on the extent of the missing parts.
 
     Raises:
         FitError: nearly everything is missing.
@@ -524,7 +531,7 @@ def _notes(model: ShapeModel, fit: FitResult, observed: BoolArray, *, with_scale
     if share < _LEAST_OBSERVED:
         raise FitError(
             f"{fit.scan_name}: it shows {100 * share:.1f} % of the model, and {100 * _LEAST_OBSERVED:g} % are needed "
-            "to complete it; give more of the object, or a model of the part that it shows."
+            "to complete it; scan more of the object, or use a model of the part that it shows."
         )
     notes = list[str]()
     if share > _COMPLETE:
@@ -534,9 +541,9 @@ def _notes(model: ShapeModel, fit: FitResult, observed: BoolArray, *, with_scale
         )
     size_stddev = None if model.training is None else model.training.log_scale_stddev
     if not with_scale:
-        notes.append("The size was fixed: sizes of shapes are part of the model, or the scale was held.")
+        notes.append("The size was fixed: sizes of shapes are part of the model, or the scale was fixed.")
     elif size_stddev is None:
-        notes.append("The size was free: the model does not know the sizes of its training shapes.")
+        notes.append("The size was free: the model does not contain the sizes of its training shapes.")
     elif abs(np.log(fit.T_scan_model.scale * fit.mm_per_scan_unit)) > OTHER_SIZE * size_stddev:
         notes.append(
             "The size was free: no training shape has the size of the fit, so the unit or scale of the scan is unknown."
@@ -558,19 +565,19 @@ def _notes(model: ShapeModel, fit: FitResult, observed: BoolArray, *, with_scale
     return notes
 
 
-def _without_part(fit: FitResult, part: str) -> Mesh:
-    """Return the scan without what shows a region of the model.
+def _remove_part(fit: FitResult, part: str) -> Mesh:
+    """Return the scan without the points that show a region of the model.
 
     Raises:
         InputError: there is no such region.
-        FitError: nothing else is left.
+        FitError: no point is left.
     """
     inside = Part.of(fit.model, part).inside
     surface = fit.surface()
     near = build_engine(surface).query(fit.scan.vertices)
     outside = ~inside[near.vertex]
     if not outside.any():
-        raise FitError(f"{fit.scan_name}: it shows nothing but the region {part!r}; give more of the object.")
+        raise FitError(f"{fit.scan_name}: it shows only the region {part!r}; scan more of the object.")
     return part_of(fit.scan, outside)
 
 
@@ -586,7 +593,7 @@ def refine_surface(completion: Completion) -> Mesh:
     model, scan = completion.model, completion.fit.scan
     M, faces = loop_operator(model.n_vertices, np.asarray(model.faces))
     x = completion.vertices
-    # Subdivision smooths; what it removes is added beforehand, so that the vertices keep their places.
+    # Subdivision smooths the surface; the difference is added beforehand, so that the vertices keep their positions.
     smooth = np.asarray(M @ (2.0 * x - (M @ x)[: len(x)]))
     near = build_engine(scan).query(smooth)
     reach = _ON_SCAN * completion.posterior.noise_mm * completion.T_scan_model.scale
@@ -609,8 +616,9 @@ def refine_surface(completion: Completion) -> Mesh:
 
 
 _PATCHES, _PRIOR_PATCHES = 300.0, 10.0
-"""Independent patches of a whole surface, as in R20a, and those that the asymmetry of the modes is worth."""
-_SEAM = 0.1  # share of the size over which the mirror image passes into what is observed
+"""Independent patches of a complete surface (R20a), and the number of patches that the asymmetry of the modes counts
+for."""
+_SEAM = 0.1  # share of the size over which the mirror image blends into the observed surface
 
 
 def add_mirror_image(
@@ -619,11 +627,11 @@ def add_mirror_image(
     """Return the surface with missing vertices moved towards the mirror images of observed ones (E8).
 
     Args:
-        model: the shape space; its mean is symmetric.
+        model: the shape model; its mean is symmetric.
         surface: (V, 3) completed by the model, mm of the model's frame.
-        observed: (V,).
-        variance: (V,) of its vertices, mm^2, against which the mirror image is weighted by the asymmetry of observed
-            pairs; None uses the mirror image alone.
+        observed: (V,) True where the scan shows the vertex.
+        variance: (V,) variance of the vertices, mm^2, against which the mirror image is weighted by the asymmetry of
+            observed pairs; None uses the mirror image alone.
 
     Returns:
         (V, 3) mm, and the mean weight of the mirror image over the missing vertices.
@@ -640,7 +648,7 @@ def add_mirror_image(
         both = is_shown & observed
         patches = _PATCHES * float(both.mean())
         own = float(((surface - image)[both] ** 2).sum() / max(both.sum(), 1))
-        asymmetry = (patches * own + _PRIOR_PATCHES * _asymmetry(model)) / (patches + _PRIOR_PATCHES)  # E7
+        asymmetry = (patches * own + _PRIOR_PATCHES * _asymmetry_variance(model)) / (patches + _PRIOR_PATCHES)  # E7
         weight *= variance / (variance + asymmetry + variance[corners[:, 0]])  # E8
     distance = cKDTree(mean[observed]).query(mean)[0] / (_SEAM * rms_size(mean))
     moved = (weight * (1.0 - np.exp(-(distance**2))))[:, None] * (image - surface)
@@ -653,14 +661,14 @@ def _mirror(model: ShapeModel) -> tuple[IntArray, FloatArray, FloatArray]:
     if mirror.off_share > SYMMETRIC_SHARE:
         raise InputError(
             f"The mean shape differs from its mirror image by {100 * mirror.off_share:.1f} % of its size, so its sides "
-            "do not predict each other; leave --mirror out."
+            "do not predict each other; omit --mirror."
         )
     return mirror.corners, mirror.weights, mirror.turn
 
 
 @cached_with_owner()
-def _asymmetry(model: ShapeModel) -> float:
-    """Return the variance of the difference between both sides in the population, mm^2 a vertex, by the modes."""
+def _asymmetry_variance(model: ShapeModel) -> float:
+    """Return the variance of the difference between both sides in the population, mm^2 per vertex, from the modes."""
     corners, weights, turn = _mirror(model)
     modes = model.vertex_basis.reshape(model.n_vertices, 3, -1) * model.stddev
     image = np.einsum("vc,vcdk,de->vek", weights, modes[corners], turn, optimize=True)

@@ -1,7 +1,7 @@
-"""Joint posterior of pose, coefficients and off-model variation given a scan, for the completion of what is missing.
+"""Joint posterior of pose, coefficients and off-model variation given a scan, for the completion of missing parts.
 
-A fit chooses its prior for small errors where the scan shows the surface. Where it shows nothing, the estimate is a
-prediction, so here the prior has the variances of new shapes with full weight, the residual modes are always free, and
+The prior of a fit is chosen for small errors where the scan shows the surface. On missing parts the estimate is a
+prediction, so here the prior has the full variances of new shapes, the residual modes are always free, and
 the error of a covariance that was estimated from N shapes is added. Equation numbers are those of docs/completion.md.
 """
 
@@ -38,18 +38,18 @@ from shapespace.model.training_shapes import MOST_SHAPES
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity
 
 _LEVEL = Level(modes=None, scan_points=20_000, vertices=500, triangles=True, iterations=15, stop_motion_mm=0.0)
-"""At most so many scan points are matched, in at most so many steps; vertices only add to the spread of residuals."""
+"""Largest number of scan points that are matched, and of steps; vertices only add to the spread of residuals."""
 _SETTLED = 2.5e-4  # share of the model's size; a step that moves no vertex further ends the iterations
-_FAR = 0.05  # share of the model's size; farther points count as points of something else
+_FAR = 0.05  # share of the model's size; points farther away count as points of another object
 _LOOSE = 10.0
 """Standard deviation of rotation (radians) and of translation (in units of the model's size): hardly a prior."""
 _AMPLITUDES = np.geomspace(1e-4, 100.0, 19)
-"""Variances of the off-model variation that are compared, in units of the one that the spectrum predicts."""
+"""Variances of the off-model variation that are compared, in units of the variance that the spectrum predicts."""
 _AMPLITUDE_STDDEV, _OF_UNKNOWN_MODEL = 1.0, 3.0
 """Standard deviation of the logarithm of the amplitude, chosen by benchmarks/completion.py on faces and femora; the
-second for models that do not state their number of shapes, whose spectrum does not predict the amplitude."""
+second is for models without a known number of shapes, whose spectrum does not predict the amplitude."""
 OTHER_SIZE = 4.0  # standard deviations of the training shapes' size
-AS_LIKELY = 3.0  # log density (a factor of 20) within which two explanations of a scan count as equally likely
+AS_LIKELY = 3.0  # log density (a factor of 20) within which two explanations of a scan are equally likely
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,18 +60,22 @@ class ShapePosterior:
         T_scan_model: mean pose, from the model's frame to the scan's mm frame.
         surface: mean surface, mm of the model's frame, with the modes that were free (K of the model, R residual).
         b: (K + R,) mean coefficients, mm.
-        covariance: (7 + K + R, 7 + K + R) of rotation (radians), translation (mm), log scale and the coefficients.
-        prior_variance: (7 + K + R,) before the scan was seen.
-        amplitude: variance of the off-model variation in units of the one that the spectrum predicts (E3).
+        covariance: (7 + K + R, 7 + K + R) covariance of rotation (radians), translation (mm), log scale and the
+            coefficients.
+        prior_variance: (7 + K + R,) variances of these parameters in the prior.
+        amplitude: variance of the off-model variation in units of the variance that the spectrum predicts (E3).
         noise_mm: robust standard deviation of the residuals, mm of the model's frame.
         followed: (V,) True where a scan point is matched.
         mismatch_mm: RMS distance of the scan's points from the surface, each up to 5 % of the model's size;
             not-a-number if settled.
         covered_mismatch_mm: robust RMS distance of the points that do not lie beyond the border of the model: the 90 %
-            quantile over that of a normal distribution, as scans contain hair, stands and stray points; likewise.
-        n_modes: K.
-        step: (P,) from the parameters of the surface to the mean of its linearised posterior; about zero if settled.
-        left_out: errors of completions of the training shapes by models of the others; None without them.
+            quantile over that of a normal distribution, as scans contain hair, supports and stray points;
+            not-a-number if settled.
+        n_modes: K, the number of modes of the model.
+        step: (P,) step from the parameters of the surface to the mean of its linearised posterior; about zero if
+            settled.
+        left_out: errors of the completions of the training shapes, each by a model of the other shapes; None without
+            training shapes.
     """
 
     T_scan_model: Similarity
@@ -96,13 +100,13 @@ class ShapePosterior:
         return -patches * float(np.log(self.mismatch_mm)) - 0.5 * (self.n_modes * self.mean_square_z + size)
 
     def vertex_covariance(self) -> FloatArray:
-        """Return (V, 3, 3) mm^2 of the positions of the vertices along the axes of the model's frame (E5)."""
+        """Return the (V, 3, 3) covariance, mm^2, of each vertex position along the axes of the model's frame (E5)."""
         rows = self.rows()
         moved = (rows.reshape(-1, rows.shape[2]) @ self.covariance.astype(np.float32)).reshape(rows.shape)
         return np.asarray(np.einsum("vip,vjp->vij", moved, rows), dtype=np.float64)
 
     def prior_vertex_variance(self) -> FloatArray:
-        """Return (V,) mm^2: the variance of the positions of the vertices in the population, in a known pose."""
+        """Return the (V,) variance, mm^2, of the vertex positions in the population, for a known pose."""
         variance = self.prior_variance[POSE:].astype(np.float32)
         return np.asarray(np.einsum("vip,p->v", self.rows()[:, :, POSE:] ** 2, variance), dtype=np.float64)
 
@@ -119,14 +123,14 @@ class ShapePosterior:
         return (rows.reshape(-1, len(root)) @ draws).T.reshape(count, *rows.shape[:2])
 
     def main_mode(self) -> FloatArray:
-        """Return (V, 3) the displacement of one standard deviation along the first principal component, mm."""
+        """Return the (V, 3) displacement of one standard deviation along the first principal component, mm."""
         rows, root = self.rows().reshape(-1, len(self.covariance)), root_of(self.covariance)
         gram = root.T @ (rows.T @ rows).astype(np.float64) @ root
         vector = np.linalg.eigh(gram)[1][:, -1]
         return np.asarray(rows @ (root @ vector), dtype=np.float64).reshape(-1, 3)
 
     def rows(self) -> Float32Array:
-        """Return (V, 3, 7 + K + R) float32 how each parameter moves each vertex."""
+        """Return the (V, 3, 7 + K + R) float32 derivatives of the vertices with respect to the parameters."""
         pose = small_poses(self.surface.vertices).reshape(-1, 3, POSE).astype(np.float32)
         return np.concatenate([pose, self.surface.modes], axis=2)
 
@@ -139,24 +143,25 @@ def shape_posterior(
     """Return the posterior near a fit with the pose `T_scan_model` and the coefficients `b` (K,) mm.
 
     Args:
-        model: the shape space, with triangles.
+        model: the shape model, with triangles.
         target: the scan in its mm frame.
-        T_scan_model: from the model's frame to that frame.
-        b: of the fit.
-        settings: of the matches and their weights.
-        with_scale: False holds the scale.
+        T_scan_model: pose of the fit, from the model's frame to the scan's mm frame.
+        b: (K,) coefficients of the fit, mm.
+        settings: settings of the matches and their weights.
+        with_scale: whether the scale is free; False fixes it.
         marks: landmarks of the scan, if any.
-        calibrated: whether to estimate the error from the training shapes (E4); a comparison of poses needs it not.
-        settled: stay at the fit.
+        calibrated: whether to estimate the error from the training shapes (E4), which a comparison of poses does not
+            need.
+        settled: whether to stay at the fit.
 
     Raises:
-        FitError: hardly anything of the scan matches, or the scan does not determine the pose.
+        FitError: hardly any point of the scan matches, or the scan does not determine the pose.
     """
     size_mm, training = rms_size(model.mean_vertices), model.training
     size_stddev = None if training is None else training.log_scale_stddev
     if size_stddev is not None and abs(np.log(T_scan_model.scale)) > OTHER_SIZE * size_stddev:
         size_stddev = None  # the scan has another size than any training shape, such as in an unknown unit
-    # If the sizes of the training shapes are known, the prior of the scale is about theirs, else about that of the fit.
+    # If the sizes of the training shapes are known, they are the prior of the scale, else the scale of the fit is.
     start_scale = T_scan_model.scale if size_stddev is None or settled else 1.0
     settings = replace(settings, scale_stddev=size_stddev or settings.scale_stddev)
     problem = Problem.of(prepare(model), target, settings, start_scale, with_scale=with_scale, marks=marks)
@@ -170,14 +175,14 @@ def shape_posterior(
         extra = residual_modes(model, settings.residual)
         problem, prior = _with_residual_modes(problem, extra)
         iterate = problem.iterate(Estimate(iterate.T_scan_model, np.pad(iterate.b, (0, len(extra.stddev)))))
-        line = _Linearised.of(problem, matcher, iterate, hint, prior, beyond_mm2)
+        line = _LinearisedLikelihood.of(problem, matcher, iterate, hint, prior, beyond_mm2)
         for _ in range(0 if settled else _LEVEL.iterations):
             before = iterate.T_scan_model.apply(iterate.surface.vertices)
             iterate = problem.iterate(iterate.estimate.moved_by(line.data.mean(line.variance) - line.theta))
             moved_mm = float(np.abs(iterate.T_scan_model.apply(iterate.surface.vertices) - before).max())
             if moved_mm < _SETTLED * size_mm * T_scan_model.scale:
                 break
-            line = _Linearised.of(problem, matcher, iterate, line.weighted.matches.hint, prior, beyond_mm2)
+            line = _LinearisedLikelihood.of(problem, matcher, iterate, line.weighted.matches.hint, prior, beyond_mm2)
         mean, left_out = line.data.mean(line.variance), None
         covariance = line.data.covariance(line.variance)
         if calibrated and (known := _known_shapes(model)) is not None:
@@ -185,9 +190,9 @@ def shape_posterior(
             covariance = left_out.covariance()
     except LinAlgError as error:
         raise FitError(
-            f"{target.mesh.name}: what it shows does not determine the pose; give landmarks (--landmarks)."
+            f"{target.mesh.name}: the scanned part does not determine the pose; give landmarks (--landmarks)."
         ) from error
-    # A settled posterior is part of each fit of a partial scan, which does not use them.
+    # A settled posterior is part of each fit of a partial scan, which does not use the mismatches.
     mismatch_mm, covered_mismatch_mm = np.nan, np.nan
     if not settled:
         points = iterate.T_scan_model.inverse().apply(matcher.points_mm)
@@ -213,7 +218,7 @@ def _mismatches_mm(surface: Mesh, points: FloatArray, far_mm: float) -> tuple[fl
 def _known_shapes(model: ShapeModel) -> FloatArray | None:
     """Return log scale and coefficients (n, 1 + K) of the training shapes.
 
-    Samples of the model represent those of a model that states their number without containing them; None otherwise.
+    Samples represent the training shapes if the model states their number without containing them; None otherwise.
     """
     if model.training is not None:
         return np.column_stack([model.training.log_scale, model.training.coefficients])
@@ -226,7 +231,7 @@ def _known_shapes(model: ShapeModel) -> FloatArray | None:
 def _with_residual_modes(problem: Problem, extra: ResidualModes) -> tuple[Problem, FloatArray]:
     """Return the problem with the residual modes, and the prior variances of its parameters (P,) (E1)."""
     model = problem.prepared.model
-    # The strongest residual modes have all of the variance that new shapes have outside the model.
+    # The strongest residual modes get the complete variance that new shapes have outside the model.
     off_model = extra.stddev**2 * (lack_of_new_shapes(model) ** 2 * model.n_vertices / (extra.stddev**2).sum())
     size_mm = rms_size(model.mean_vertices)
     scale = problem.prior.scale_stddev**2
@@ -238,22 +243,22 @@ def _with_residual_modes(problem: Problem, extra: ResidualModes) -> tuple[Proble
 
 
 @dataclass(frozen=True, eq=False)
-class _Linearised:
+class _LinearisedLikelihood:
     """Likelihood of the matches of an iterate.
 
     Args:
-        weighted: the matches.
+        weighted: weighted matches.
         followed: (V,) True where a scan point is matched.
-        data: their likelihood,
-        theta: at these parameters (P,); the pose is relative to the iterate.
-        amplitude: likeliest one of the off-model variation (E3).
-        variance: (P,) of the prior with this amplitude.
-        log_evidence: of it (E3).
+        data: likelihood of the matches.
+        theta: (P,) parameters at which the likelihood is linearised; the pose is relative to the iterate.
+        amplitude: likeliest amplitude of the off-model variation (E3).
+        variance: (P,) variances of the prior with this amplitude.
+        log_evidence: log evidence of this amplitude (E3).
     """
 
     weighted: WeightedMatches
     followed: BoolArray
-    data: _Data
+    data: _DataLikelihood
     theta: FloatArray
     amplitude: float
     variance: FloatArray
@@ -262,8 +267,8 @@ class _Linearised:
     @staticmethod
     def of(
         problem: Problem, matcher: Matcher, iterate: Iterate, hint: MatchHint, prior: FloatArray, beyond_mm2: float
-    ) -> _Linearised:
-        """Return the likelihood near `iterate` (E2), and the amplitude given it (E3)."""
+    ) -> _LinearisedLikelihood:
+        """Return the likelihood near `iterate` (E2), and the likeliest amplitude (E3)."""
         weighted = problem.match(matcher, iterate, hint)
         gathered, equations = problem.equations(weighted, iterate, len(iterate.b))
         matches = float(weighted.weights.points.sum()) + float(weighted.weights.vertices.sum())
@@ -275,25 +280,27 @@ class _Linearised:
             H, pull = H + H_landmarks, pull - gradient
         log_scale = np.log(iterate.T_scan_model.scale / problem.prior.start_scale)
         theta = np.concatenate([np.zeros(SCALE), [log_scale], iterate.b])
-        data = _Data(H, pull + H @ theta)
+        data = _DataLikelihood(H, pull + H @ theta)
         model = problem.prepared.model
         first = POSE + model.n_modes
         stddev = _AMPLITUDE_STDDEV if model.is_n_training_known else _OF_UNKNOWN_MODEL
-        # The variance of the off-model variation that scan and spectrum make likeliest, and its evidence (E3).
-        score = [data.log_evidence(_scaled(prior, first, a)) - 0.5 * (np.log(a) / stddev) ** 2 for a in _AMPLITUDES]
+        # The variance of the off-model variation that is likeliest given scan and spectrum, and its evidence (E3).
+        score = [
+            data.log_evidence(_scale_variances(prior, first, a)) - 0.5 * (np.log(a) / stddev) ** 2 for a in _AMPLITUDES
+        ]
         best = int(np.argmax(score))
         amplitude, log_evidence = float(_AMPLITUDES[best]), score[best]
-        variance = _scaled(prior, first, amplitude)
-        return _Linearised(weighted, gathered.seen, data, theta, amplitude, variance, log_evidence)
+        variance = _scale_variances(prior, first, amplitude)
+        return _LinearisedLikelihood(weighted, gathered.seen, data, theta, amplitude, variance, log_evidence)
 
 
 @dataclass(frozen=True, eq=False)
-class _Data:
-    """Precision and pull of the data: -theta^T H theta / 2 + pull^T theta is their log likelihood (E2).
+class _DataLikelihood:
+    """Precision and pull of the data: their log likelihood is -theta^T H theta / 2 + pull^T theta (E2).
 
     Args:
-        H: (P, P).
-        pull: (P,).
+        H: (P, P) precision.
+        pull: (P,) precision times the position of the optimum.
     """
 
     H: FloatArray
@@ -323,29 +330,30 @@ class _Data:
         return float(0.5 * pull @ cho_solve((factor, True), pull) - np.log(factor.diagonal()).sum())
 
 
-def _scaled(prior: FloatArray, first: int, amplitude: float) -> FloatArray:
+def _scale_variances(prior: FloatArray, first: int, amplitude: float) -> FloatArray:
     """Return the prior variances with those from `first` on times `amplitude`."""
     return np.concatenate([prior[:first], amplitude * prior[first:]])
 
 
-MOST_LEFT_OUT = 50  # shapes; standard deviations are then known to 10 %, and the time is seconds for 500 modes
-_FEWEST_LEFT_OUT, _MOST_WORK = 12, 10_000  # shapes, and shapes times modes: models of more modes leave out fewer shapes
-_OFF_MODEL = 60  # residual modes, the strongest, that vary together with what a shape has outside the others' span
-_COVERED = 0.95  # of the regions for which the covariance is exact
+MOST_LEFT_OUT = 50  # shapes; standard deviations then have an error of 10 %, and the time is seconds for 500 modes
+_FEWEST_LEFT_OUT, _MOST_WORK = 12, 10_000  # shapes, and shapes times modes: with more modes fewer shapes are held out
+_OFF_MODEL = 60  # strongest residual modes; they vary together with the part of a shape outside the others' span
+_COVERED = 0.95  # share of the regions for which the covariance is exact
 _ROUNDING = 1e-12  # share of the largest variance
 
 
 @dataclass(frozen=True, eq=False)
 class LeftOutErrors:
-    """Errors of the completions of n training shapes, each by the model of the others (E4).
+    """Errors of the completions of n training shapes, each by the model of the other shapes (E4).
 
     The P parameters are those of the completion: pose, coefficients and off-model variation.
 
     Args:
         known: (n, 1 + K) log scale and coefficients of the shapes, mm.
-        errors: (n, P) of the parameters, without noise of the scan.
-        noise: (P, P) covariance of the errors by noise of the scan.
-        shifts: (n, P) from the completion of the scan to the one by the model without the shape.
+        errors: (n, P) errors of the parameters, without noise of the scan.
+        noise: (P, P) covariance of the errors due to noise of the scan.
+        shifts: (n, P) differences between the completion of the scan by the model without the shape and its completion
+            by the complete model.
     """
 
     known: FloatArray
@@ -356,13 +364,13 @@ class LeftOutErrors:
     def covariance(self) -> FloatArray:
         """Return the covariance (P, P) of the predictive distribution of the error (E4)."""
         n = len(self.errors)
-        # Hotelling's T^2 of one of n errors, so that regions of 95 % of a vertex contain 95 %.
+        # Hotelling's T^2 of one of n errors, so that 95 % regions of a vertex contain it with a probability of 95 %.
         factor = 3 * n / (n - 2) * float(f.ppf(_COVERED, 3, n - 2) / chi2.ppf(_COVERED, 3))
         return self.errors.T @ self.errors * (factor / n) + self.noise
 
 
 def root_of(covariance: FloatArray) -> FloatArray:
-    """Return a root R (P, P) of a covariance, R R^T; scaled, as angles and coefficients differ in size."""
+    """Return a root R (P, P) of a covariance, R R^T; it is scaled, as angles and coefficients differ in size."""
     unit = np.sqrt(np.maximum(covariance.diagonal(), 1e-300))
     value, vector = np.linalg.eigh(covariance / np.outer(unit, unit))
     return unit[:, None] * vector * np.sqrt(np.maximum(value, 0.0))
@@ -372,14 +380,14 @@ def leave_one_out(
     known: FloatArray, H: FloatArray, pull: FloatArray, mean: FloatArray, variance: FloatArray,
     extra: ResidualModes,
 ) -> LeftOutErrors:  # fmt: skip
-    """Return the errors of the completions of training shapes, each by the model of the others (E4).
+    """Return the errors of the completions of training shapes, each by the model of the other shapes (E4).
 
     Args:
         known: (n, 1 + K) log scale of the shapes, and coefficients in all modes of the model, mm.
         H: (P, P) precision of the data.
-        pull: (P,) of the data.
-        mean: (P,) of the posterior of the scan.
-        variance: (P,) of the prior; zero holds a parameter.
+        pull: (P,) pull of the data.
+        mean: (P,) posterior mean of the scan.
+        variance: (P,) prior variances; zero fixes a parameter.
         extra: the residual modes.
     """
     coefficients = known[:, 1:]
@@ -407,8 +415,8 @@ def leave_one_out(
         off = ((coefficients - coefficients[i]) ** 2).sum(axis=1)
         others = coefficients[off > _ROUNDING * off.max()]  # a copy of the shape would predict it
         mu[c], theta[c], theta[: c.start] = others.mean(axis=0), coefficients[i], known[i, : c.start]
-        prior[c, c], outside = _prior_of(others - mu[c])
-        # What leaves the span of the others has the prior of the residual modes, with which it varies together.
+        prior[c, c], outside = _prior_and_complement(others - mu[c])
+        # The part outside the span of the others has the prior of the residual modes, with which it varies together.
         off_model = share * extra.covariance_outside(outside, z[i], n)[:, : end - POSE]
         prior[c, c] += off_model[:, :K] @ outside @ outside.T
         prior[c, c.stop :], prior[c.stop :, c] = off_model[:, K:], off_model[:, K:].T
@@ -417,11 +425,11 @@ def leave_one_out(
         errors[row, kept], shifts[row, kept] = solved.T
     errors[:, other] = -errors[:, kept] @ slaved.T
     shifts[:, other] = pull_other - shifts[:, kept] @ slaved.T
-    return LeftOutErrors(known[chosen], errors, _noise(H, variance), shifts - mean)
+    return LeftOutErrors(known[chosen], errors, _noise_covariance(H, variance), shifts - mean)
 
 
-def _noise(H: FloatArray, variance: FloatArray) -> FloatArray:
-    """Return the covariance (P, P) of the posterior mean by noise of the data."""
+def _noise_covariance(H: FloatArray, variance: FloatArray) -> FloatArray:
+    """Return the covariance (P, P) of the posterior mean due to noise of the data."""
     free = np.flatnonzero(variance > 0)
     H = H[np.ix_(free, free)]
     gain = np.linalg.inv(H + np.diag(1.0 / variance[free]))
@@ -430,8 +438,8 @@ def _noise(H: FloatArray, variance: FloatArray) -> FloatArray:
     return out
 
 
-def _prior_of(others: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the prior covariance (K, K) of the model of centred shapes (m, K), and a basis (K, r) of what it lacks."""
+def _prior_and_complement(others: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the prior covariance (K, K) of a model of centred shapes (m, K), and a basis (K, r) of its complement."""
     m = len(others)
     value, vector = np.linalg.eigh(others.T @ others / (m - 1))
     rank = min(m - 1, int((value > _ROUNDING * value[-1]).sum()))

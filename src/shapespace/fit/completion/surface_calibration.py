@@ -20,19 +20,20 @@ from shapespace.geometry.similarity import POSE, small_poses
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, Similarity
 
-_SAMPLED = 1_000  # missing vertices that the expected error is the mean of
-_SIGNIFICANT = 0.01  # probability to call a completion better than the mean shape that is not
+_SAMPLED = 1_000  # missing vertices over which the expected error is averaged
+_SIGNIFICANT = 0.01  # probability to call a completion better than the mean shape although it is not
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceCalibration:
-    """Completions of n training shapes, each by the model of the others, mm of the model's frame.
+    """Completions of n training shapes, each by the model of the other shapes, mm of the model's frame.
 
     Args:
         shapes: (n, V, 3) the training shapes.
-        errors: (n, V, 3) of their completions.
-        mean_errors: (n, V, 3) of the mean shape in the best pose on the observed vertices.
-        shifts: (n, V, 3) from the completion of the scan to the one by the model without the shape.
+        errors: (n, V, 3) errors of their completions.
+        mean_errors: (n, V, 3) errors of the mean shape in the best pose on the observed vertices.
+        shifts: (n, V, 3) differences between the completion of the scan by the model without the shape and its
+            completion by the complete model.
         missing: (V,) True where the scan shows nothing.
         of_training: False if samples of the model represent its training shapes, which it does not contain.
     """
@@ -56,7 +57,7 @@ class SurfaceCalibration:
 
     @property
     def mean_weight(self) -> FloatArray:
-        """(V,) weight of the mean shape that minimises the squared error of the left-out shapes, 0 to 1 (E10)."""
+        """(V,) weight of the mean shape, 0 to 1, that minimises the squared error of the held-out shapes (E10)."""
         off = self.errors.astype(np.float64) - self.mean_errors
         along = np.einsum("nvd,nvd->v", self.errors, off)
         return np.clip(along / np.maximum(np.einsum("nvd,nvd->v", off, off), 1e-30), 0.0, 1.0)
@@ -92,8 +93,8 @@ class SurfaceCalibration:
         distribution if there are too few shapes for its quantiles.
 
         Args:
-            function: of vertices (V, 3) in the frame of the model, mm.
-            vertices: (V, 3) of the completed surface in that frame.
+            function: function of the vertices (V, 3) in the frame of the model, mm.
+            vertices: (V, 3) vertices of the completed surface in that frame.
             level: probability of the interval.
         """
         n, value = len(self), function(vertices)
@@ -112,16 +113,16 @@ def missing_error_mm(
     model: ShapeModel, target: ScanTarget, T_scan_model: Similarity, b: FloatArray, observed: BoolArray,
     *, with_scale: bool,
 ) -> float | None:  # fmt: skip
-    """Return the expected distance of missing vertices of a fit from their true places, mm of the scan.
+    """Return the expected distance of missing vertices of a fit from their true positions, mm of the scan.
 
-    It is the mean over the training shapes, left out in turn; None without training shapes, or if the scan does not
-    determine the pose.
+    It is the mean over the training shapes, each held out in turn; None without training shapes, or if the scan does
+    not determine the pose.
 
     Args:
-        model: the shape space.
+        model: the shape model.
         target: the scan in its mm frame.
         T_scan_model: pose of the fit in that frame.
-        b: (K,) its coefficients, mm.
+        b: (K,) coefficients of the fit, mm.
         observed: (V,) True where the scan shows a vertex.
         with_scale: whether the scale was free.
     """
@@ -142,7 +143,7 @@ def missing_error_mm(
     rows = posterior.rows()[some]
     errors = (rows.reshape(-1, rows.shape[2]) @ left.errors.T.astype(np.float32)).reshape(len(some), 3, -1)
     noise = np.einsum("vip,pq,viq->v", rows, left.noise.astype(np.float32), rows, optimize=True)
-    # The fit is off the posterior mean, of which the errors are.
+    # The errors are those of the posterior mean, from which the fit differs.
     step = ((rows @ posterior.step.astype(np.float32)) ** 2).sum(axis=1)
     return float(np.sqrt((errors**2).sum(axis=1) + (noise + step)[:, None]).mean()) * T_scan_model.scale
 
@@ -151,8 +152,8 @@ def calibrate(posterior: ShapePosterior, model: ShapeModel, missing: BoolArray) 
     """Return the calibration of the surface on the training shapes; None if the model neither contains nor counts them.
 
     Args:
-        posterior: of the scan, with the errors of left-out shapes.
-        model: with all modes of its training shapes.
+        posterior: posterior of the scan, with the errors of the held-out shapes.
+        model: the model with all modes of its training shapes.
         missing: (V,) True where the scan shows nothing.
     """
     left = posterior.left_out

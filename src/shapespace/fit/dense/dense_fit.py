@@ -1,15 +1,15 @@
 """Dense stage of a fit: smooth displacement fields from the fitted surface to the scan, on the model's triangles.
 
-The field d is a Gaussian process of the Matern kind, written as a stochastic differential equation on the surface
+The field d is a Gaussian process with a Matern covariance, written as a stochastic differential equation on the surface
 (Lindgren, Rue and Lindstrom, J. R. Stat. Soc. B 73, 2011), so that its precision is sparse. Its posterior mean given
 the matches minimises
 
     sum_i w_i (n_i^T (x_i + d_i - q_i))^2 / noise^2  +  |(kappa^2 - Laplacian) d|^2 / (4 pi kappa^2 amplitude^2)
 
 with the matches of `robust` (both directions, without borders and disagreeing normals, robustly weighted), each
-gathered on the vertices that carry it. Only distances along the normals are matched: sideways the surface goes with its
-neighbours. First d is a field of vectors whose amplitude goes by what the fit left unexplained; then one along the
-normals takes up the details. Where nothing is seen both fade, and the surface stays what the model says.
+gathered on the vertices that carry it. Only distances along the normals are matched: tangentially each vertex follows
+its neighbours. First d is a vector field whose amplitude depends on the unexplained residual of the fit; then a field
+along the normals adds the details. Where nothing is observed both fields fade, and the surface follows the model.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ def compare_triangles(
     """Compute the rotation of each triangle, and whether it agrees with its neighbours.
 
     Args:
-        vertices: (V, 3),
-        normals: (V, 3) unit.
-        faces: (F, 3).
-        normals_before: (F, 3) their unit normals before.
-        cosine: (F,) to be written: of the angle between then and now; 0 without area.
-        even: (F,) to be written: whether each lies within 90 degrees of the normals at its corners.
+        vertices: (V, 3) vertices.
+        normals: (V, 3) unit normals of the vertices.
+        faces: (F, 3) triangles.
+        normals_before: (F, 3) unit normals of the triangles before.
+        cosine: (F,) output: cosine of the angle between the normals before and now; 0 without area.
+        even: (F,) output: whether each triangle lies within 90 degrees of the normals at its corners.
     """
     n = np.empty(3)
     for f in range(len(faces)):
@@ -68,7 +68,7 @@ def compare_triangles(
 
 
 @compiled
-def _times_into(
+def _multiply_into(
     x: FloatArray,
     ring_start: IntArray,
     ring: IntArray,
@@ -96,7 +96,7 @@ def _times_into(
 
 
 @compiled
-def _conditioned_into(
+def _condition_into(
     left: FloatArray, along: FloatArray, seen_at: FloatArray, stiffness: FloatArray, out: FloatArray
 ) -> float:
     """Write (k I + s n n^T)^-1 left for each vertex, and return its product with `left`."""
@@ -129,43 +129,43 @@ def solve_field(
 ) -> int:
     """Solve (D + A M^-1 A) x = r by preconditioned conjugate gradients from `x`; return the iterations done.
 
-    D has s_v n_v n_v^T for each vertex v, and r has p_v n_v.
+    D consists of s_v n_v n_v^T for each vertex v, and r of p_v n_v.
 
     Args:
-        ring_start: (V + 1,) where the neighbours of each vertex start in
-        ring: (R,).
-        off_diagonal: (R,) of A, symmetric, and
-        diagonal: (V,) of A.
-        inverse_mass: (V,) of M.
-        stiffness: (V,) the diagonal of A M^-1 A.
-        seen_at: (V,) s, how much the data weigh at each vertex.
-        pull_at: (V,) p, where they want it, times s.
+        ring_start: (V + 1,) start of the neighbours of each vertex in `ring`.
+        ring: (R,) neighbours of the vertices.
+        off_diagonal: (R,) off-diagonal entries of the symmetric matrix A.
+        diagonal: (V,) diagonal of A.
+        inverse_mass: (V,) inverse of the diagonal mass matrix M.
+        stiffness: (V,) diagonal of A M^-1 A.
+        seen_at: (V,) s, the precision of the data at each vertex.
+        pull_at: (V,) p, the displacement along the normal that the data suggest, times s.
         along: (V, C) unit vectors n; C is 3, or 1 for a field without direction.
-        x: (V, C) the start, to be overwritten.
-        tolerance: it ends when the error has this share of the size of the first, from a field of zeros.
-        iterations: at most.
+        x: (V, C) start, which is overwritten.
+        tolerance: size of the error at which the solver stops, as a share of the first error from a field of zeros.
+        iterations: maximum number of iterations.
     """
     ones = np.ones(len(x))
     left, image, between, z = np.empty_like(x), np.empty_like(x), np.empty_like(x), np.empty_like(x)
     for v in range(len(x)):
         for d in range(x.shape[1]):
             left[v, d] = pull_at[v] * along[v, d]
-    size = _conditioned_into(left, along, seen_at, stiffness, z)
-    _times_into(x, ring_start, ring, off_diagonal, diagonal, inverse_mass, between)
-    _times_into(between, ring_start, ring, off_diagonal, diagonal, ones, image)
+    size = _condition_into(left, along, seen_at, stiffness, z)
+    _multiply_into(x, ring_start, ring, off_diagonal, diagonal, inverse_mass, between)
+    _multiply_into(between, ring_start, ring, off_diagonal, diagonal, ones, image)
     for v in range(len(x)):
         inner = 0.0
         for d in range(x.shape[1]):
             inner += along[v, d] * x[v, d]
         for d in range(x.shape[1]):
             left[v, d] -= image[v, d] + seen_at[v] * inner * along[v, d]
-    product = _conditioned_into(left, along, seen_at, stiffness, z)
+    product = _condition_into(left, along, seen_at, stiffness, z)
     direction = z.copy()
     for iteration in range(iterations):
         if product <= tolerance * tolerance * size:
             return iteration
-        _times_into(direction, ring_start, ring, off_diagonal, diagonal, inverse_mass, between)
-        _times_into(between, ring_start, ring, off_diagonal, diagonal, ones, image)
+        _multiply_into(direction, ring_start, ring, off_diagonal, diagonal, inverse_mass, between)
+        _multiply_into(between, ring_start, ring, off_diagonal, diagonal, ones, image)
         curvature = 0.0
         for v in range(len(x)):
             inner = 0.0
@@ -179,7 +179,7 @@ def solve_field(
             for d in range(x.shape[1]):
                 x[v, d] += step * direction[v, d]
                 left[v, d] -= step * image[v, d]
-        previous_product, product = product, _conditioned_into(left, along, seen_at, stiffness, z)
+        previous_product, product = product, _condition_into(left, along, seen_at, stiffness, z)
         keep = product / previous_product
         for v in range(len(x)):
             for d in range(x.shape[1]):
@@ -187,11 +187,11 @@ def solve_field(
     return iterations
 
 
-_FEWEST_MATCHES = 30  # below it no robust standard deviation is estimated
-_FEWEST_PAIRS = 100  # below it the noise is not separated from the residual
-_HALVINGS = 8  # halvings of a step before a folded vertex goes back: 1/256 of it
+_FEWEST_MATCHES = 30  # with fewer no robust standard deviation is estimated
+_FEWEST_PAIRS = 100  # with fewer the noise is not separated from the residual
+_HALVINGS = 8  # number of times the step of a folded vertex is halved before it is undone: 1/256 of the step
 _SEEN = 0.1
-"""Matches that together weigh as much show a vertex; a good one weighs 1."""
+"""Total weight of the matches of a vertex from which on the vertex counts as observed; a good match weighs 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,12 +199,12 @@ class DenseSurface:
     """The fitted surface displaced onto the scan.
 
     Args:
-        vertices_scan_mm: (V, 3) in the scan's mm frame.
-        seen: (V,) False where the scan shows nothing and the model stands in.
-        noise_mm: of the scan as found, mm of the model's frame.
-        unexplained_mm: RMS of what the fit left that is no noise, mm of the model's frame.
-        damped: how many vertices were held back so that no triangle folds.
-        moved_mm: RMS of how far what is seen moved along the normals, mm of the model's frame.
+        vertices_scan_mm: (V, 3) vertices in the scan's mm frame.
+        seen: (V,) False where the scan shows nothing and the vertex follows the model.
+        noise_mm: estimated noise of the scan, mm of the model's frame.
+        unexplained_mm: RMS of the residuals of the fit without the noise, mm of the model's frame.
+        damped: number of vertices that were held back so that no triangle folds.
+        moved_mm: RMS displacement of the observed vertices along their normals, mm of the model's frame.
     """
 
     vertices_scan_mm: FloatArray
@@ -224,18 +224,18 @@ def dense_surface(
 ) -> DenseSurface:
     """Displace the surface `vertices_scan_mm` onto the scan where the scan observes it.
 
-    No triangle folds: none turns over, or against its neighbours, that does not in `vertices_scan_mm`.
+    No triangle folds: a triangle turns over, or against its neighbours, only if it does so in `vertices_scan_mm`.
 
     Args:
-        model: gives the triangles, and the mean on which the field is smooth.
+        model: shape model with the triangles, and with the mean on which the field is smooth.
         target: the scan in its mm frame.
         vertices_scan_mm: (V, 3) the fitted surface in that frame.
-        T_scan_model: from the model's frame to the scan's mm frame; settings are in mm of the former.
-        settings: of this stage.
+        T_scan_model: transform from the model's frame to the scan's mm frame; settings are in mm of the model's frame.
+        settings: settings of this stage.
 
     Raises:
         InputError: the model has no triangles.
-        FitError: hardly anything of the scan matches the surface.
+        FitError: hardly any point of the scan matches the surface.
     """
     topology, T = prepare(model).topology, T_scan_model
     start = T.inverse().apply(vertices_scan_mm)
@@ -246,24 +246,24 @@ def dense_surface(
     noise_mm, left_mm = matches.noise_mm, matches.unexplained_mm
     displacement = np.zeros_like(start)
     if left_mm > settings.least_unexplained_mm:
-        coarse = _field(model, settings.range_share * size_mm, settings.amplitude * left_mm)
+        coarse = _matern_field(model, settings.range_share * size_mm, settings.amplitude * left_mm)
         for _ in range(settings.rounds):
             seen_at, pull_at = matches.gathered(max(noise_mm, matches.spread_mm))
             want = seen_at * np.einsum("vd,vd->v", surface.normals, displacement) - pull_at
             coarse.solve(seen_at, want, surface.normals, displacement, settings)
             surface = ModelSurface.of(topology, start + displacement)
-            matches = _match(matcher, surface, T, matches.matches.hint, settings)
-            # Neighbours also disagree where the surface is steep beside the scan, so the last is the best.
+            matches = _match_surface(matcher, surface, T, matches.matches.hint, settings)
+            # Neighbours also disagree where the surface is steep compared with the scan, so the last is the best.
             noise_mm = min(noise_mm, matches.noise_mm)
 
-    fine = _field(model, settings.fine_range_share * size_mm, settings.fine_amplitude_mm)
+    fine = _matern_field(model, settings.fine_range_share * size_mm, settings.fine_amplitude_mm)
     base, is_folded = revert_folds(start, start, start + displacement, topology, settings.turn_cosine)
     out, along, normals = np.zeros((len(start), 1)), np.ones((len(start), 1)), surface.normals
     seen_at = np.zeros(len(start))
     for round_ in range(settings.fine_rounds):
         if round_:
             surface = ModelSurface.of(topology, base + out * normals)
-            matches = _match(matcher, surface, T, matches.matches.hint, settings)
+            matches = _match_surface(matcher, surface, T, matches.matches.hint, settings)
         seen_at, pull_at = matches.gathered(noise_mm)
         fine.solve(seen_at, seen_at * out[:, 0] - pull_at, along, out, settings)
     is_unfolded, held_back = revert_folds(start, base, base + out * normals, topology, settings.turn_cosine)
@@ -278,12 +278,12 @@ class WeightedMatches:
     """Matches of the surface, with the spread and the noise of their residuals.
 
     Args:
-        matches: both ways.
-        faces: (F, 3) of the surface,
-        vertices: how many it has.
-        settings: of the stage.
-        spread_mm: of the residuals of the scan's points.
-        noise_mm: of the scan.
+        matches: matches of both directions.
+        faces: (F, 3) triangles of the surface.
+        vertices: number of vertices of the surface.
+        settings: settings of the stage.
+        spread_mm: robust standard deviation of the residuals of the scan's points, mm of the model's frame.
+        noise_mm: noise of the scan, mm of the model's frame.
     """
 
     matches: Matches
@@ -300,7 +300,7 @@ class WeightedMatches:
 
     @property
     def unexplained_mm(self) -> float:
-        """RMS of the residuals' part that is no noise."""
+        """RMS of the residuals without the noise."""
         weights = self._weights(self.spread_mm)
         left = self.matches.unexplained_variance(weights, self.faces, self.vertices, self.settings.seed)
         return float(np.sqrt(max(left, 0.0)))
@@ -317,15 +317,15 @@ def _first_matches(
     """Return the matcher, with triangles that are flat or stand for a smooth surface, and the first matches.
 
     Raises:
-        FitError: hardly anything of the scan matches the surface.
+        FitError: hardly any point of the scan matches the surface.
     """
-    matcher = _matcher(target, surface.topology, settings)
+    matcher = _build_matcher(target, surface.topology, settings)
     hint = matcher.first_hint(surface, T)
     matcher = choose_bulging(matcher, surface, T, hint)
-    return matcher, _match(matcher, surface, T, hint, settings)
+    return matcher, _match_surface(matcher, surface, T, hint, settings)
 
 
-def _matcher(target: ScanTarget, topology: Topology, settings: DenseSettings) -> Matcher:
+def _build_matcher(target: ScanTarget, topology: Topology, settings: DenseSettings) -> Matcher:
     count = len(target.mesh.vertices)
     chosen = np.arange(count, dtype=np.int32)
     if count > settings.scan_points:
@@ -339,21 +339,21 @@ def _matcher(target: ScanTarget, topology: Topology, settings: DenseSettings) ->
     )
 
 
-def _match(
+def _match_surface(
     matcher: Matcher, surface: ModelSurface, T: Similarity, hint: MatchHint, settings: DenseSettings
 ) -> WeightedMatches:
     """Return the matches of the surface, and the spread and the noise of their residuals.
 
     Raises:
-        FitError: hardly anything of the scan matches the surface.
+        FitError: hardly any point of the scan matches the surface.
     """
     matches = matcher.match(surface, T, hint)
     points = np.flatnonzero(matches.points.allowed)
     if len(points) < _FEWEST_MATCHES:
-        raise FitError(f"{matcher.target.mesh.name}: too little of it matches the fitted surface to go on from there.")
+        raise FitError(f"{matcher.target.mesh.name}: too few of its points match the fitted surface to displace it.")
     residual = matches.points.residual
     spread_mm = spread(residual[points])
-    # How much points that lie next to each other disagree is noise.
+    # Noise is estimated from the disagreement of neighbouring points.
     nearest = matches.points.nearest
     points = points[np.argsort(nearest[points], kind="stable")]
     pairs = nearest[points[1:]] == nearest[points[:-1]]
@@ -370,11 +370,11 @@ class Field:
     """A Matern field on a surface, with precision A M^-1 A.
 
     Args:
-        topology: whose rings the off-diagonal entries follow.
-        off_diagonal: (R,) of A.
-        diagonal: (V,) of A.
-        inverse_mass: (V,) of M.
-        stiffness: (V,) the diagonal of A M^-1 A.
+        topology: triangles and vertex neighbours of the surface; the off-diagonal entries are in the order of `ring`.
+        off_diagonal: (R,) off-diagonal entries of A.
+        diagonal: (V,) diagonal of A.
+        inverse_mass: (V,) inverse of the diagonal of M.
+        stiffness: (V,) diagonal of A M^-1 A.
     """
 
     topology: Topology
@@ -401,7 +401,7 @@ class _Laplacian:
     area: FloatArray
 
 
-def _field(model: ShapeModel, range_mm: float, amplitude_mm: float) -> Field:
+def _matern_field(model: ShapeModel, range_mm: float, amplitude_mm: float) -> Field:
     """Return the field with that standard deviation and range on the mean of `model`."""
     t = prepare(model).topology
     laplacian = _mean_laplacian(model)
@@ -438,16 +438,16 @@ def _laplacian(x: FloatArray, topology: Topology) -> _Laplacian:
 def revert_folds(
     start: FloatArray, base: FloatArray, displaced: FloatArray, topology: Topology, turn_cosine: float
 ) -> tuple[FloatArray, BoolArray]:
-    """Return `displaced` (V, 3) held back towards `base` where triangles would fold, and (V,) where that is.
+    """Return `displaced` (V, 3), pulled back towards `base` where triangles would fold, and the mask (V,) of that.
 
     A triangle folds when it turns over, or against its neighbours, and did not do so in `start`.
 
     Args:
         start: (V, 3) the surface to compare with.
-        base: (V, 3) one on which nothing is folded.
+        base: (V, 3) a surface without folds.
         displaced: (V, 3) the requested surface.
-        topology: its triangles.
-        turn_cosine: cosine of the angle that no triangle turns further than.
+        topology: triangles of the surface.
+        turn_cosine: cosine of the largest angle by which a triangle may turn.
     """
     faces = topology.faces
     normals_before = face_vectors(start, faces)
@@ -472,6 +472,6 @@ def revert_folds(
             share[is_held] *= 0.5
             share[is_neighbour & ~is_held] *= 0.75
         else:
-            # A triangle is as it is by its neighbours' corners, so with all of them on `base` it is no longer folded.
+            # Only the corners of its neighbours decide whether a triangle is folded; with all on `base`, it is not.
             share[is_neighbour] = 0.0
         out = base + share[:, None] * (displaced - base)

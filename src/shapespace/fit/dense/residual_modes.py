@@ -1,10 +1,10 @@
-"""What a shape may do that its model cannot: mirrored, and smooth local, versions of the model's own modes.
+"""Residual modes: mirrored, and smooth local, versions of the model's own modes, for shapes outside its span.
 
-A model of N shapes spans N - 1 directions, and a new shape always leaves them. What it leaves varies as the modes do,
-only locally: so the covariance of the model damped with distance is a prior for it (Wilms, Handels and Ehrhardt,
-Medical Image Analysis 38, 2017). Where the mean is its own mirror image, the mirrored modes belong there too, as in
-models built with mirrored shapes. Only the part outside the model's span is kept, as further modes beside the model's
-own, so that b keeps its meaning.
+A model of N shapes spans N - 1 directions, and a new shape is never in their span. The part outside varies as the modes
+do, only locally: so the covariance of the model damped with distance is a prior for it (Wilms, Handels and Ehrhardt,
+Medical Image Analysis 38, 2017). If the mean is symmetric, the mirrored modes are added too, as in
+models built with mirrored shapes. Only the part outside the model's span is kept, as further modes in addition to the
+model's own, so that b keeps its meaning.
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray
 
 _ALGORITHM_VERSION = 2
-"""Part of the key of the disk cache: raise it whenever `_make`, `local_modes` or `mirror` compute other modes."""
+"""Part of the key of the disk cache: raise it if `_compute_modes`, `local_modes` or `mirror` compute other modes."""
 _LEAST_VALUE = 1e-8  # share of the largest eigenvalue; below are float32 rounding and linear dependence
 _SYMMETRIC_SHARE = 0.01
-"""A mean whose mirror image lies within this share of its size is taken for symmetric."""
+"""Distance of a mean from its mirror image, as a share of its size, up to which it counts as symmetric."""
 
 
 @dataclass(frozen=True, eq=False)
 class ResidualModes:
-    """Modes that the model lacks.
+    """Modes outside the span of the model.
 
     Args:
         modes: (V, 3, K + R) float32, the model's modes and then R more, orthogonal to them.
-        stddev: (R,) mm.
+        stddev: (R,) standard deviations of the residual modes, mm.
         products: (K + R, C) mm of the C local and mirrored modes along all of these modes.
-        mode: (C,) mode of the model of which each one was made.
-        field: (C,) field, or mirror image, by which it was made.
+        mode: (C,) index of the model's mode from which each local or mirrored mode was made.
+        field: (C,) index of the smooth field, or mirror image, by which it was made.
     """
 
     modes: Float32Array
@@ -58,11 +58,11 @@ class ResidualModes:
     field: IntArray
 
     def covariance_outside(self, outside: FloatArray, z: FloatArray, count: int) -> FloatArray:
-        """Return the covariance (K, K + R), mm^2, of what shapes have outside the span of all training shapes but one.
+        """Return the covariance (K, K + R), mm^2, of shapes outside the span of all training shapes but one.
 
         Args:
-            outside: (K, r) orthonormal basis of what lies outside that span.
-            z: (K,) coefficients of the one, in standard deviations; no local mode is made of it.
+            outside: (K, r) orthonormal basis of the complement of that span.
+            z: (K,) coefficients of the held-out shape, in standard deviations; no local mode is made from it.
             count: number of shapes.
         """
         K = len(outside)
@@ -76,21 +76,21 @@ class ResidualModes:
 def residual_modes(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
     """Return the strongest modes outside the span of `model`, computed once for each model and settings.
 
-    Those of a model that was read from a file, or saved to one, are cached on disk too.
+    The modes of a model that was read from a file, or saved to one, are cached on disk too.
     """
     if not model.in_file:
-        return _make(model, settings)
+        return _compute_modes(model, settings)
     key = disk_cache.key("residual", _ALGORITHM_VERSION, model.content_hash, settings)
     arrays = disk_cache.recall(key)
     names = [item.name for item in fields(ResidualModes)]
     if arrays is not None and set(names) <= arrays.keys():
         return ResidualModes(*(arrays[name] for name in names))
-    made = _make(model, settings)
+    made = _compute_modes(model, settings)
     disk_cache.keep(key, {name: getattr(made, name) for name in names})
     return made
 
 
-def _make(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
+def _compute_modes(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
     x, stddev = model.mean_vertices, model.stddev.astype(np.float32)
     modes = np.asarray(prepare(model).modes)
     mirror = _mirror(model)
@@ -121,7 +121,7 @@ def _make(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
     significant = value > _LEAST_VALUE * value[0]
     stddev_mm = np.sqrt(value[significant])
     mix = (vector[:, significant] / stddev_mm).astype(np.float32)
-    # The products along the residual modes are what the eigenvectors of their Gram matrix say.
+    # The eigenvectors of the Gram matrix contain the products along the residual modes.
     along = np.concatenate([inside, stddev_mm[:, None] * vector[:, significant].T])
     inside = inside @ mix
     together = np.empty((*modes.shape[:2], modes.shape[2] + len(stddev_mm)), dtype=np.float32)
@@ -141,7 +141,7 @@ def _make(model: ShapeModel, settings: ResidualSettings) -> ResidualModes:
 
 
 def _mirror(model: ShapeModel) -> Callable[[Float32Array], Float32Array] | None:
-    """Return what turns fields (V, 3, k) on the mean into their mirror images; None if the mean is not symmetric."""
+    """Return a function that mirrors fields (V, 3, k) on the mean; None if the mean is not symmetric."""
     mean = model.mesh()
     symmetry = find_mirror(mean)
     if symmetry.off_share > _SYMMETRIC_SHARE:

@@ -1,8 +1,8 @@
-"""How far off a robust fit is and whether it failed, from its evidence: an expected error and a verdict.
+"""Expected error and verdict of a robust fit, from its evidence.
 
-Predictors are logarithms and shares without a unit, each larger the worse a fit is. Two linear functions of them,
-fitted to simulated scans whose truth is known, make the estimate. A fit failed if its mean vertex error exceeds
-`FAILED_SHARE` of the model's size, or if the scan shows another object.
+Predictors are logarithms and shares without a unit; a larger predictor means a worse fit. The estimate consists of two
+linear functions of the predictors, fitted to simulated scans whose truth is known. A fit failed if its mean vertex
+error exceeds `FAILED_SHARE` of the model's size, or if the scan shows another object.
 
 - The score is the logit of a failure: above zero a fit is doubtful. Its coefficients were fitted to 560 fits of the
   split "dev", 174 of them wrong, by `benchmarks/trust.py --tune`; the offset leaves 5 % of the good ones doubtful.
@@ -45,7 +45,7 @@ class MatchEvidence:
         model_lack_mm: RMS distance of new shapes from the span of the model.
         marks_stddev_mm: standard deviation of the given landmarks; None without landmarks.
         marks_rms_mm: RMS distance of the given landmarks from their places; None without landmarks.
-        posterior_error_mm: RMS vertex error by the posterior, with what is outside the model's modes.
+        posterior_error_mm: RMS vertex error from the posterior, including the variation outside the model's modes.
     """
 
     size_mm: float
@@ -70,12 +70,12 @@ class MatchEvidence:
 
 @dataclass(frozen=True, kw_only=True)
 class ScanEvidence(MatchEvidence):
-    """Diagnostics of the last iterate, of the start and of the whole scan.
+    """Diagnostics of the last iterate, of the start and of the complete scan.
 
     Args:
         training_shapes: number of training shapes of the model; 0 if unknown.
-        start_score_mm: score of the start; NaN where no start was searched for.
-        start_runner_up_score_mm: score of the best other start; infinite where there is none.
+        start_score_mm: score of the start; NaN if no pose search was run.
+        start_runner_up_score_mm: score of the best other start; infinite if there is no other start.
         layered_share: share of the scan that consists of two layers.
         layers_apart_mm: distance of these layers.
         displaced_share: share of the scan that runs along the fitted surface at a distance.
@@ -100,20 +100,21 @@ class FitEvidence(ScanEvidence):
     """All diagnostics of a robust fit; the field names are the keys of `evidence` in NAME.fit.json.
 
     Args:
-        expected_error_mm: median over such fits of the mean vertex error.
+        expected_error_mm: median of the mean vertex error over fits with such evidence.
         error_low_mm: lower end of the 90 % interval of the mean vertex error.
         error_high_mm: upper end of that interval.
         failure_probability: probability that the fit failed, see `failure_model`.
-        mirrored_log_odds: log odds (nats) that the scan is mirrored; None where that was not tested.
-        mirrored_apart_mm: mean distance of the vertices from those of the fit to the mirror image, which is by how much
-            they are off if the scan is mirrored; None where the mirror image was not fitted.
-        mirrored_bound: largest of these log odds of left-out training shapes; None where they were not fitted, as where
-            the model does not explain the mirror image either.
+        mirrored_log_odds: log odds (nats) that the scan is mirrored; None if that was not tested.
+        mirrored_apart_mm: mean distance of the vertices from those of the fit to the mirror image, which is their error
+            if the scan is mirrored; None if the mirror image was not fitted.
+        mirrored_bound: largest of these log odds over the training shapes, each held out in turn; None if they were not
+            fitted, for example because the model does not explain the mirror image either.
         displaced_moved_mm: robust standard deviation of the displaced parts about the fitted surface after a similarity
-            moved them onto it; None where no part is displaced, or the model does not explain the rest of the scan.
-        displaced_bound: largest `displaced_share` of left-out training shapes; None where they were not fitted.
-        second_instance_mm: distance of a second instance in the scan; None where none was found.
-        second_instance_gap_mm: gap between the two instances, negative if they overlap; None where none was found.
+            moved them onto it; None if no part is displaced, or if the model does not explain the rest of the scan.
+        displaced_bound: largest `displaced_share` over the training shapes, each held out in turn; None if they were
+            not fitted.
+        second_instance_mm: distance of a second instance in the scan; None if none was found.
+        second_instance_gap_mm: gap between the two instances, negative if they overlap; None if none was found.
 
     Example:
         >>> 0 <= fit.evidence.model_matched_share <= 1
@@ -144,11 +145,11 @@ COVERAGE = 0.9
 _PROBABLY_FAILED = 0.5
 """Failure probability above which a fit is doubtful, whatever its score is."""
 _SMALLEST = 1e-6
-"""Of a ratio before its logarithm is taken; below the `lowest` of every term."""
+"""Lower bound of a ratio before its logarithm is taken; below the `lowest` of every term."""
 _SMALLEST_SHARE = 0.01  # bound of a share before its logarithm, so that no term grows without limit
 _LARGEST_LOG_SCALE = 1.0  # bound of the logarithm of the scale, a factor of e, for the same reason
 _MOST_REASONS, _STATED_SHARE = 3, 0.4
-"""At most so many reasons are stated, each with at least this share of the largest contribution."""
+"""Largest number of stated reasons, and their smallest share of the largest contribution."""
 _NEAR_THROUGHOUT = 0.8
 """Share of the model's vertices near the scan from which the model, not the pose, explains large coefficients."""
 
@@ -181,10 +182,10 @@ class Term(Generic[_E]):
     """One term of a linear function of predictors: weight * (max(predictor, lowest) - usual).
 
     Args:
-        predictor: of the evidence; larger for worse fits.
-        weight: not negative.
-        lowest: value of the clearest good fits; a predictor below it contributes no less.
-        usual: median over good fits; 0 where the offset contains it.
+        predictor: function that computes the predictor from the evidence; larger for worse fits.
+        weight: weight of the term, not negative.
+        lowest: value of the clearest good fits; smaller predictors count as this value.
+        usual: median over good fits; 0 if the offset contains it.
     """
 
     predictor: Callable[[_E], float]
@@ -197,7 +198,7 @@ class Term(Generic[_E]):
         return max(self.predictor(evidence), self.lowest)
 
     def contribution(self, evidence: _E) -> float:
-        """Return what the term adds to the linear function."""
+        """Return the contribution of the term to the linear function."""
         return self.weight * (self.value(evidence) - self.usual)
 
 
@@ -207,7 +208,7 @@ class ScoreTerm(Term[MatchEvidence]):
 
     Args:
         limit: value of the predictor above which a fit is doubtful, whatever its score is.
-        reason: states the predictor.
+        reason: function that returns the reason which states the predictor.
     """
 
     limit: float
@@ -321,10 +322,11 @@ class ErrorEstimate:
     """Expected error of a fit: the mean over the model's vertices, mm of the scan.
 
     Args:
-        expected_error_mm: half of such fits have a smaller error.
-        error_low_mm: lower end of the interval that holds the error of 90 % of such fits.
+        expected_error_mm: median error of fits with such evidence.
+        error_low_mm: lower end of the interval that contains the error of 90 % of such fits.
         error_high_mm: upper end of that interval.
-        failure_probability: that the fit failed, if as many fits fail as among those that the model was fitted to.
+        failure_probability: probability that the fit failed, for the failure rate of the fits on which the failure
+            model was trained.
 
     Example:
         >>> fit.evidence.error_low_mm <= fit.evidence.expected_error_mm <= fit.evidence.error_high_mm
@@ -346,9 +348,10 @@ def estimate_error(evidence: ScanEvidence, missing_share: float = 0.0, missing_e
     """Return the expected error of the fit with this evidence.
 
     Args:
-        evidence: of the fit.
+        evidence: evidence of the fit.
         missing_share: share of the model's vertices that the scan does not show.
-        missing_error_mm: their expected error by the training shapes, which the evidence does not contain.
+        missing_error_mm: expected error of the missing vertices, estimated on the training shapes, as the evidence does
+            not contain it; mm of the scan.
     """
     shown_mm = math.exp(estimate_log_error(evidence)) * evidence.size_mm
     expected_mm = (1.0 - missing_share) * shown_mm + missing_share * missing_error_mm
@@ -358,10 +361,10 @@ def estimate_error(evidence: ScanEvidence, missing_share: float = 0.0, missing_e
 
 
 def with_mirror_image(evidence: FitEvidence) -> FitEvidence:
-    """Return the evidence with an expected error that includes the exchange of the sides of an object.
+    """Return the evidence with an expected error that accounts for a possible exchange of left and right.
 
     Args:
-        evidence: of a fit whose chirality is undecidable, with the distance to the fit of the mirror image.
+        evidence: evidence of a fit whose chirality is undecidable, with the distance to the fit of the mirror image.
     """
     log_odds, apart_mm = evidence.mirrored_log_odds, evidence.mirrored_apart_mm
     if log_odds is None or apart_mm is None:
@@ -381,7 +384,7 @@ def failure_score(evidence: MatchEvidence) -> float:
 
 
 def find_failure_reasons(evidence: FitEvidence) -> list[Reason]:
-    """Return reasons to expect that a fit failed, the largest contribution first; empty where there are none."""
+    """Return reasons to expect that a fit failed, the largest contribution first; empty without such reasons."""
     if not is_doubtful(evidence):
         return _find_probable_failure(evidence)
     plausible = replace(evidence, z2=min(evidence.z2, 1.0), z2_leading=min(evidence.z2_leading, 1.0))
@@ -423,7 +426,7 @@ def _find_probable_failure(evidence: FitEvidence) -> list[Reason]:
 
 
 Chirality: TypeAlias = Literal["as scanned", "mirrored", "undecidable"]
-"""Whether left and right of a scan are as those of the model."""
+"""Whether left and right of a scan agree with those of the model."""
 
 _LAYERED = 0.16
 """Share of a scan over which it has two surfaces; chosen on fits of `benchmarks/reliability.py`."""
@@ -444,7 +447,7 @@ mirrored scans of the development seeds reach 7 and more, correct fits of unmirr
 
 
 def find_odd_scan_reasons(evidence: FitEvidence) -> list[Reason]:
-    """Return reasons in the scan or the model to doubt a fit, the most serious first; empty where there are none."""
+    """Return reasons in the scan or the model to doubt a fit, the most serious first; empty without such reasons."""
     return [
         *_find_mirrored(evidence),
         *_find_layers(evidence),
@@ -458,7 +461,8 @@ def chirality_of(mirrored_log_odds: float | None, mirrored_bound: float | None) 
 
     Args:
         mirrored_log_odds: log odds (nats) that the scan is mirrored; None if that was not tested.
-        mirrored_bound: largest log odds of training shapes, each compared by the model of the others; None if unknown.
+        mirrored_bound: largest log odds over the training shapes, each compared with the model of the other shapes;
+            None if unknown.
     """
     if mirrored_log_odds is None or abs(mirrored_log_odds) < _DECIDED:
         return "undecidable"
@@ -474,12 +478,12 @@ def is_side_undecidable(evidence: FitEvidence) -> bool:
 
 
 def converged_reason(spread_mm: float, matched_share: float, evidence: FitEvidence | None) -> Reason:
-    """Return that a fit converged, with the distance of the vertices if the sides of the object may be exchanged.
+    """Return the reason of a converged fit, with the vertex distance if the sides of the object may be exchanged.
 
     Args:
         spread_mm: robust standard deviation of the residuals.
         matched_share: share of the model's vertices that are matched.
-        evidence: of the fit.
+        evidence: evidence of the fit; None without diagnostics.
     """
     data: dict[str, float | str] = {"spread_mm": spread_mm, "model_matched_share": matched_share}
     if evidence is not None and evidence.mirrored_apart_mm is not None and is_side_undecidable(evidence):
@@ -526,7 +530,7 @@ def _find_inconsistent_parts(evidence: FitEvidence) -> list[Reason]:
 
 
 def _find_few_shapes(evidence: FitEvidence) -> list[Reason]:
-    """Find that the shape leaves the span of a model of few shapes."""
+    """Return a reason if the shape leaves the span of a model of few shapes."""
     shapes, beyond_mm = evidence.training_shapes, evidence.beyond_model_mm
     if not 0 < shapes < _FEW_SHAPES or beyond_mm < _LEAVES_SPAN * evidence.size_mm:
         return []

@@ -1,4 +1,4 @@
-"""Why a fit has its status: codes with data, and their English text, the only place where codes become sentences."""
+"""Reasons for the status of a fit: codes with data, and their English text, which no other module makes."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class ReasonCode(StrEnum):
     SCAN_NOT_COVERED = "scan_not_covered"  # scan_covered_share
     DISTANCES_DIFFER = "distances_differ"  # scan_to_model_median_mm, model_to_scan_median_mm
     MAIN_COEFFICIENTS_IMPLAUSIBLE = "main_coefficients_implausible"  # coefficients, z_rms
-    # of other methods
+    # reasons of methods outside this package
     OTHER = "other"  # text
 
 
@@ -69,8 +69,8 @@ class Reason:
     """One reason for the status of a fit.
 
     Args:
-        code: the kind of reason.
-        data: its numbers by name, lengths in mm of the scan, see `ReasonCode`; the text of `OTHER`.
+        code: code of the reason.
+        data: numbers of the reason by name, lengths in mm of the scan, see `ReasonCode`; the text of `OTHER`.
     """
 
     code: ReasonCode
@@ -78,10 +78,11 @@ class Reason:
 
     @staticmethod
     def other(text: str) -> Reason:
-        """Return a reason that has no code of its own, such as one of a method outside this package.
+        """Return a reason without a code of its own, such as one of a method outside this package.
 
         Args:
-            text: for a converged fit a whole sentence, for a doubtful one a clause without a full stop.
+            text: text of the reason: for a converged fit a complete sentence, for a doubtful fit a clause without a
+                full stop.
         """
         return Reason(ReasonCode.OTHER, {"text": text})
 
@@ -167,9 +168,9 @@ _TEXTS: Mapping[ReasonCode, Callable[[Mapping[str, Any]], str]] = MappingProxyTy
             "as the model predicts; it is probably another object, or contains parts of others"
         ),
         ReasonCode.NO_SKILL: lambda d: (
-            f"the missing part is not predicted better than by the mean shape: of {d['training_shapes']:.0f} training "
-            f"shapes left out in turn, the completion is nearer than the mean shape for {d['nearer']:.0f}; build a "
-            "model of more shapes, or give more of the object"
+            "the missing part is not predicted better than by the mean shape: of "
+            f"{d['training_shapes']:.0f} training shapes, each held out in turn, the completion is nearer than the "
+            f"mean shape for {d['nearer']:.0f}; build a model of more shapes, or scan more of the object"
         ),
         ReasonCode.FEW_TRAINING_SHAPES: lambda d: (
             f"the model is made of {d['training_shapes']:.0f} shapes, too few to predict how others differ, and this "
@@ -243,6 +244,6 @@ def text_of(code: str, data: Mapping[str, Any]) -> str:
 
 
 def sentence_of(status: str, reasons: Sequence[Reason]) -> str:
-    """Return one sentence on why a fit has its status."""
+    """Return one sentence that explains the status of a fit."""
     text = "; ".join(text_of(reason.code, reason.data) for reason in reasons)
     return f"{DOUBTFUL}{text}." if status == "doubtful" else text

@@ -1,25 +1,26 @@
-"""The verdict on what is returned: pose, coefficients and surface must agree with each other, whatever the method."""
+"""The verdict on a result: pose, coefficients and surface must agree with each other, for every method."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from shapespace.fit.diagnostics.reasons import Reason, ReasonCode
-from shapespace.fit.method import Ended, Method
+from shapespace.fit.method import FitOutcome, Method
 from shapespace.fit.result import Status
 
 _FARTHEST_Z = 10.0
-"""Standard deviations of new shapes; the plain method goes to 8 on real scans, where faint modes chase details."""
+"""Standard deviations of new shapes; the plain method reaches 8 on real scans, where faint modes follow details."""
 _OTHER_SCALE = 0.05  # logarithm, 5 %: scale that projection onto the modes may change
 _MOVED_AWAY, _LEAST_MOVED_SHARE = 1.5, 0.005
-"""The nearest shape in the span lies as far from a surface as that leaves the span, and hardly farther."""
+"""Ratio to the distance outside the span, and share of the size, by which the projection onto the span may move a
+surface; its nearest shape in the span lies about as far from it as that distance."""
 _DENSE_MOVED_SHARE = 0.009
-"""Dense surfaces move along their normals by a quarter of that share of the size where the model is made for them; of
-those that move further, most lie elsewhere than they belong (docs/dense.md)."""
+"""Share of the size; dense surfaces move along their normals by a quarter of it if the model suits the scan, and most
+of those that move further have vertices in wrong positions (docs/dense.md)."""
 
 
-def judge(method: Method, ended: Ended) -> tuple[Status, tuple[Reason, ...]]:
-    """Return status and reasons of a fit: contradictions in what is returned, then the doubts of the method."""
+def judge(method: Method, ended: FitOutcome) -> tuple[Status, tuple[Reason, ...]]:
+    """Return status and reasons of a fit: contradictions in the result, then the doubts of the method."""
     doubts = [*find_contradictions(ended), *method.doubts(ended)]
     if doubts:
         return "doubtful", tuple(doubts)
@@ -30,8 +31,8 @@ def judge(method: Method, ended: Ended) -> tuple[Status, tuple[Reason, ...]]:
     return "converged", (method.reason(ended),)
 
 
-def find_contradictions(ended: Ended) -> list[Reason]:
-    """Return how pose, coefficients and surface contradict each other; empty where they agree."""
+def find_contradictions(ended: FitOutcome) -> list[Reason]:
+    """Return the contradictions between pose, coefficients and surface; empty if they agree."""
     from shapespace.fit.robust.posterior import variance_of_new_shapes  # compiled, and loads SciPy
 
     model, fitted, reasons = ended.model, ended.fitted, list[Reason]()

@@ -12,7 +12,7 @@ import numpy as np
 from shapespace.errors import InputError
 from shapespace.fit.diagnostics.reasons import Reason, ReasonCode
 from shapespace.fit.iteration_state import Fitted, IcpState, StopRule, all_followed, largest_motion
-from shapespace.fit.method import Ended, Limits
+from shapespace.fit.method import FitOutcome, Limits
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.search.initialisation import Start
 from shapespace.geometry.closest import ENGINES, ClosestPointEngine
@@ -26,7 +26,7 @@ _SHRUNK_BY_SHAPE = 0.85
 _SHRUNK_IN_ALL = 0.7  # ratio of the final scale to that of the start
 _LEADING_SHARE = 0.9  # share of variance of the main coefficients
 _IMPLAUSIBLE = 1e-5  # probability that a new shape exceeds the bound on its coefficients
-_CLOSE_SHARE = 0.01  # share of the size; a surface nearer than this is right however unusual its coefficients
+_CLOSE_SHARE = 0.01  # share of the size; a surface nearer than this is correct however unusual its coefficients
 _FAR_SHARE = 0.05  # share of the size that the model may lie from the scan (RMS)
 _GAP_RATIO = 4.0  # ratio of the median distances scan to model and model to scan
 _GAP_SHARE = 0.02  # share of the size; smaller medians are good whatever their ratio
@@ -39,8 +39,8 @@ class Paper:
 
     Args:
         search: closest points: `vertices` of the scan, as in the paper, or points on its `surface`, the triangles.
-        stop_rate: the paper's tau: stop when the RMS changes by at most this share,
-        stop_motion_mm: and no vertex moves more than this, mm of the model's frame.
+        stop_rate: the paper's tau: stop when the RMS changes by at most this share.
+        stop_motion_mm: largest movement of a vertex, mm of the model's frame, up to which the iteration may stop.
 
     Raises:
         InputError: a search that does not exist, or a rule that cannot stop.
@@ -66,7 +66,7 @@ class Paper:
     def states(
         self, model: ShapeModel, scan: ScanTarget, start: Start, limits: Limits
     ) -> Generator[IcpState, None, Fitted]:
-        """Yield the states of phase 1, then those of phase 2 from where it ended; only the modes asked for are used."""
+        """Yield the states of phase 1, then those of phase 2, which starts at its end; only `limits.modes` are used."""
         model = model if limits.modes is None else model.truncate(limits.modes)
         stop, engine, T_scan_model = self.stop_rule(limits.max_iterations), scan.search(self.search), start.T_scan_model
         for state in similarity_icp(model, engine, T_scan_model, stop, with_scale=limits.with_scale):
@@ -88,8 +88,8 @@ class Paper:
             regions=partial(all_followed, model.n_vertices),
         )
 
-    def reason(self, ended: Ended) -> Reason:
-        """Return why it stopped."""
+    def reason(self, ended: FitOutcome) -> Reason:
+        """Return why the iteration stopped."""
         return Reason(
             ReasonCode.CONVERGED_BY_RATE,
             {
@@ -99,7 +99,7 @@ class Paper:
             },
         )
 
-    def doubts(self, ended: Ended) -> list[Reason]:
+    def doubts(self, ended: FitOutcome) -> list[Reason]:
         """Return reasons in the distances, the scale and the main coefficients to doubt the fit."""
         model, final, initial = ended.model, ended.stages["final"], ended.stages["initial"]
         forward, backward = final.distances.model_to_scan, final.distances.scan_to_model
@@ -123,7 +123,7 @@ class Paper:
             reasons.append(Reason(ReasonCode.DISTANCES_DIFFER, medians_mm))
         leading = min(modes_for_variance(model.stddev**2, _LEADING_SHARE), len(final.b))
         z2 = float(((final.b[:leading] / model.stddev[:leading]) ** 2).mean())
-        # An extreme shape that lies on the scan all over is what the scan shows.
+        # A surface that lies on the scan everywhere is correct, however extreme its shape is.
         if z2 > _hotelling_bound(leading, model.n_training) and forward.rms > _CLOSE_SHARE * size_mm:
             data = {"coefficients": leading, "z_rms": float(np.sqrt(z2))}
             reasons.append(Reason(ReasonCode.MAIN_COEFFICIENTS_IMPLAUSIBLE, data))
@@ -133,11 +133,11 @@ class Paper:
 def posterior_stddev(model: ShapeModel, residual_variance: float) -> FloatArray:
     """Return the standard deviation (K,), mm, of the coefficients given a complete surface.
 
-    Probabilistic PCA with orthonormal modes: var_k = lam_k v / (lam_k + v) (Tipping and Bishop, 1999). It takes the
-    residuals of the coordinates for independent, which they are not, so it is too small.
+    Probabilistic PCA with orthonormal modes: var_k = lam_k v / (lam_k + v) (Tipping and Bishop, 1999). It assumes that
+    the residuals of the coordinates are independent, which they are not, so the result is too small.
 
     Args:
-        model: gives lam_k = stddev_k^2.
+        model: shape model, with lam_k = stddev_k^2.
         residual_variance: v, mm^2 per coordinate.
     """
     variance = model.stddev**2
@@ -165,11 +165,11 @@ def similarity_icp(
     """Yield the start and each iteration of phase 1, until the RMS closest distance stops falling.
 
     Args:
-        model: its mean shape is moved, its modes are not used.
+        model: shape model whose mean is moved; its modes are not used.
         scan: search structure of the scan, in the scan's mm frame.
-        T_scan_model: the start.
+        T_scan_model: the initial pose.
         stop: the stopping rule.
-        with_scale: False holds the scale of the start.
+        with_scale: whether the scale is free; False fixes the scale of the start.
 
     Raises:
         InputError: the matches determine no similarity, or the pose has diverged.
@@ -207,15 +207,15 @@ def shape_icp(
 ) -> Iterator[IcpState]:
     """Yield the start and each iteration of phase 2, until the RMS closest distance stops falling.
 
-    Each of the three steps lowers sum_j |c_j - y_j|^2 or leaves it, so the RMS in the scan's frame never rises.
+    Each of the three steps never raises sum_j |c_j - y_j|^2, so the RMS in the scan's frame never rises.
 
     Args:
-        model: mean and modes.
+        model: shape model, with mean and modes.
         scan: search structure of the scan, in the scan's mm frame.
-        T_scan_model: where phase 1 ended.
+        T_scan_model: the pose at the end of phase 1.
         stop: the stopping rule.
         b: (K,) coefficients to start from, mm; None for the mean.
-        with_scale: False holds the scale of the start.
+        with_scale: whether the scale is free; False fixes the scale of the start.
 
     Raises:
         InputError: the matches determine no similarity, or the fit has diverged.
@@ -244,7 +244,7 @@ def shape_icp(
 
 
 def fit_pose(source: np.ndarray, target: np.ndarray, before: Similarity, with_scale: bool) -> Similarity:
-    """Return the least-squares pose of `source` on `target` (V, 3); without scale, that of `before` is kept."""
+    """Return the least-squares pose of `source` on `target` (V, 3); `with_scale` False keeps the scale of `before`."""
     if with_scale:
         return fit_similarity(source, target)
     rigid = fit_similarity(before.scale * source, target, with_scale=False)

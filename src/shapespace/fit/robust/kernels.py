@@ -1,4 +1,4 @@
-"""The loops of the robust fit, compiled: normals, the walk to the closest point of a moving model, and its rows."""
+"""Compiled loops of the robust fit: normals, the walk to the closest point of a moving model, and its rows."""
 
 from __future__ import annotations
 
@@ -60,23 +60,23 @@ def walk_into(
     triangle: IntArray,
     weights: FloatArray,
 ) -> None:
-    """Find the closest model point of each of `points` (M, 3) by walking over the edges from the last answer.
+    """Find the closest model point of each of `points` (M, 3) by walking over the edges from the last match.
 
-    A point that still lies over its triangle stays there. Else downhill from vertex to vertex, then over the triangles
-    around the one where the walk ends. It can end in a local minimum, so whoever calls it begins with exact answers
-    where the model has moved far.
+    A point that still lies over its triangle keeps it. Otherwise the walk goes downhill from vertex to vertex, then
+    over the triangles around its last vertex. It can end in a local minimum, so callers start from exact matches
+    if the model has moved far.
 
     Args:
-        points: (M, 3).
-        vertex: (M,) where each walk starts, and then where it ended.
-        vertices: (V, 3) of the model in the frame of `points`.
-        faces: (F, 3) its triangles.
-        ring_start: (V + 1,) where the neighbours of each vertex start in
-        ring: (R,).
-        fan_start: (V + 1,) where the triangles around each vertex start in
-        fan: (3F,).
-        triangle: (M,) the last answers, -1 for none, and then the new ones.
-        weights: (M, 3) barycentric, to be written.
+        points: (M, 3) query points, mm.
+        vertex: (M,) start vertex of each walk, replaced by its end.
+        vertices: (V, 3) vertices of the model in the frame of `points`, mm.
+        faces: (F, 3) triangles of the model.
+        ring_start: (V + 1,) start of the neighbours of each vertex in `ring`.
+        ring: (R,) neighbours of the vertices.
+        fan_start: (V + 1,) start of the triangles around each vertex in `fan`.
+        fan: (3F,) triangles around the vertices.
+        triangle: (M,) triangles of the last matches, -1 if unknown, replaced by those of the new matches.
+        weights: (M, 3) output: barycentric coordinates of the matches.
     """
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
@@ -124,18 +124,18 @@ def meet_into(
     """Compare each point with the model point it was matched to.
 
     Args:
-        points: (M, 3) in the model's frame.
-        point_normals: (M, 3) unit normals there, zero where unknown.
-        triangle: (M,) of the model,
-        weights: (M, 3) barycentric.
-        vertices: (V, 3) of the model,
-        normals: (V, 3) its unit normals.
-        faces: (F, 3).
+        points: (M, 3) points in the model's frame, mm.
+        point_normals: (M, 3) unit normals at the points, zero if unknown.
+        triangle: (M,) triangle of the model on which each point is matched.
+        weights: (M, 3) barycentric coordinates of the match on its triangle.
+        vertices: (V, 3) vertices of the model, mm.
+        normals: (V, 3) unit normals of the model's vertices.
+        faces: (F, 3) triangles of the model.
         rim: (V,) True on the model's border.
-        residual: (M,) to be written: how far the model lies beyond the point along the model's normal.
-        distance: (M,) to be written.
-        cosine: (M,) to be written: between the normals; 1 where the point has none.
-        covered: (M,) to be written: False where the match lies on the border, so that the model ends there.
+        residual: (M,) output: distance by which the model lies beyond the point along the model's normal, mm.
+        distance: (M,) output: distance of the point from its match, mm.
+        cosine: (M,) output: cosine of the angle between the normals; 1 if the point has no normal.
+        covered: (M,) output: False if the match lies on the border, so that the model ends there.
     """
     for i in range(len(points)):
         a, b, c = faces[triangle[i], 0], faces[triangle[i], 1], faces[triangle[i], 2]
@@ -168,11 +168,11 @@ def on_scan_into(
 
     Args:
         corners: (N, c) vertices of the scan that carry each match: three of a triangle, or one.
-        weights: (N, c) barycentric.
-        scan_normals: (S, 3).
+        weights: (N, c) barycentric weights of these vertices.
+        scan_normals: (S, 3) unit normals of the scan's vertices.
         rim: (S,) True on the border of the scan.
-        normals: (N, 3) to be written, not quite of unit length between vertices.
-        inside: (N,) to be written.
+        normals: (N, 3) output: normals at the matches, not exactly of unit length between vertices.
+        inside: (N,) output: True for matches off the border of the scan.
     """
     for i in range(len(corners)):
         x, y, z, off_rim = 0.0, 0.0, 0.0, False
@@ -198,13 +198,13 @@ def compare_into(
     """Compare each vertex of the model with its match on the scan (R5, R6).
 
     Args:
-        to_scan: (N, 3) from the match to the vertex, in the model's frame.
-        model_normals: (N, 3) unit normals of the vertices,
-        scan_normals: (N, 3) of the matches; (0, 3) of a scan without triangles, whose normals are not tested.
-        winding: -1 where the scan's normals are reversed, else 1.
-        normal_cosine: matches whose normals disagree more than this are not allowed.
-        residual: (N,) to be written.
-        allowed: (N,) False where it is already; to be set to False where the normals disagree.
+        to_scan: (N, 3) vector from the match to the vertex, in the model's frame, mm.
+        model_normals: (N, 3) unit normals of the vertices.
+        scan_normals: (N, 3) normals of the matches; (0, 3) for a scan without triangles, whose normals are not tested.
+        winding: -1 if the scan's normals are reversed, else 1.
+        normal_cosine: cosine of the largest angle between the normals of an allowed match.
+        residual: (N,) output: residuals along the normals of the model, mm.
+        allowed: (N,) mask of allowed matches, set to False if the normals disagree.
     """
     for i in range(len(to_scan)):
         nx, ny, nz = model_normals[i, 0], model_normals[i, 1], model_normals[i, 2]
@@ -225,18 +225,18 @@ def less_sag(
     faces: IntArray,
     residual: FloatArray,
 ) -> None:
-    """Add to each residual (M,) how far the surface through the corners bulges over its flat triangle.
+    """Add to each residual (M,) the height by which the surface through the corners bulges over its flat triangle.
 
     The tangent planes at the corners lie twice as far over a point of the triangle as a quadric with those normals
     (Boubekeur and Alexa, ACM Trans. Graph. 27, 2008, with the share of one half).
 
     Args:
-        triangle: (M,) of the surface,
-        barycentric: (M, 3) where on it.
-        vertices: (V, 3).
-        normals: (V, 3) unit.
-        faces: (F, 3).
-        residual: (M,) along the normals, to be added to.
+        triangle: (M,) triangle of the surface for each residual.
+        barycentric: (M, 3) barycentric coordinates on the triangle.
+        vertices: (V, 3) vertices of the surface, mm.
+        normals: (V, 3) unit normals of the vertices.
+        faces: (F, 3) triangles of the surface.
+        residual: (M,) residuals along the normals, mm, to which the height is added.
     """
     for i in range(len(triangle)):
         a, b, c = faces[triangle[i], 0], faces[triangle[i], 1], faces[triangle[i], 2]
@@ -285,14 +285,14 @@ def rows_into(
     Row j is sqrt(W_j) J_j, with J_j = n_j^T [ -[x_j]x | I | x_j | P_j ].
 
     Args:
-        vertices: (V, 3) model vertices x,
-        normals: (V, 3) their unit normals.
+        vertices: (V, 3) model vertices x, mm.
+        normals: (V, 3) unit normals of the model vertices.
         basis: (V, 3, C) modes, float32.
         modes: k, the number of free modes.
         W: (V,) weight of each vertex.
-        h: (V,) its weighted residual, mm.
-        rows: (V, 7 + C) float32 to be written.
-        gradient: (7 + C,) to be added to.
+        h: (V,) weighted residual of each vertex, mm.
+        rows: (V, 7 + C) float32 output: weighted rows of the Jacobian.
+        gradient: (7 + C,) gradient, to which that of the matches is added.
     """
     count = 0
     for j in range(len(vertices)):

@@ -1,7 +1,7 @@
-"""Matches between a surface on the model's triangles and the scan, both ways: of every stage of a fit the same.
+"""Matches in both directions between a surface on the model's triangles and the scan, the same in all stages of a fit.
 
-Each scan point goes to the closest point of the moving surface, which a walk from the last answer finds, and each
-vertex of the surface to the closest point of the scan. A robust weight, chosen by its name, is how much a match counts.
+Each scan point is matched to the closest point of the moving surface, which a walk from the last match finds, and each
+vertex of the surface to the closest point of the scan. A robust weight, selected by its name, weighs each match.
 Equation numbers are those of docs/robust.md.
 """
 
@@ -21,7 +21,7 @@ from shapespace.types import BoolArray, FloatArray, IntArray, Similarity
 
 
 def welsch(residual: FloatArray, scale: float) -> FloatArray:
-    """Return exp(-r^2 / (2 scale^2)): what lies far off counts nothing (Zhang, Yao and Deng, PAMI 2022)."""
+    """Return exp(-r^2 / (2 scale^2)): distant matches do not count (Zhang, Yao and Deng, PAMI 2022)."""
     return np.exp(-0.5 * (residual / scale) ** 2)  # R8a
 
 
@@ -31,7 +31,7 @@ def geman_mcclure(residual: FloatArray, scale: float) -> FloatArray:
 
 
 def huber(residual: FloatArray, scale: float) -> FloatArray:
-    """Return 1 up to `scale` and scale / |r| beyond: nothing is ever left out (Huber, 1964)."""
+    """Return 1 up to `scale` and scale / |r| beyond: no match is excluded (Huber, 1964)."""
     return scale / np.maximum(np.abs(residual), scale)  # R8c
 
 
@@ -54,7 +54,7 @@ def spread(residual: FloatArray) -> float:
 
 def tails(residual: FloatArray, spread_mm: float) -> float:
     """Return the 90 % quantile of |residual| (M,) over that of normal noise of this spread (R6b)."""
-    # What np.quantile returns, bit for bit, in a third of its time.
+    # The same value as np.quantile, bit for bit, in a third of its time.
     place = _TAIL * (len(residual) - 1)
     below = int(place)
     above = min(below + 1, len(residual) - 1)
@@ -67,15 +67,15 @@ def tails(residual: FloatArray, spread_mm: float) -> float:
 def match_weights(
     name: str, residual: FloatArray, distance: FloatArray, allowed: BoolArray, width_mm: float, far_mm: float
 ) -> FloatArray:
-    """Return the weights (M,) of matches by the weight called `name`: residuals against a width, distances against far.
+    """Return the weights (M,) of matches by the weight called `name`, from their residuals and distances.
 
     Args:
-        name: of `WEIGHTS`.
-        residual: (M,) mm.
-        distance: (M,) mm.
-        allowed: (M,) False for matches that count nothing.
-        width_mm: scale of the residuals.
-        far_mm: scale of the distances.
+        name: name of the weight, one of `WEIGHTS`.
+        residual: (M,) residuals, mm.
+        distance: (M,) distances, mm.
+        allowed: (M,) False for matches that do not count.
+        width_mm: scale of the residuals, mm.
+        far_mm: scale of the distances, mm.
     """
     weight = WEIGHTS[name]
     return weight(residual, width_mm) * weight(distance, far_mm) * allowed
@@ -86,12 +86,12 @@ class PointMatches:
     """Scan points matched to the moving surface, (M,) each; residuals and distances in mm of the model's frame.
 
     Args:
-        triangle: of the model, where each point is matched,
-        barycentric: (M, 3) and where on it.
-        nearest: vertex where the walk to it ended.
-        residual: how far the model lies beyond each point along the model's normal.
-        distance: to its match.
-        allowed: False where the model ends, and where the normals disagree.
+        triangle: (M,) triangle of the model on which each point is matched.
+        barycentric: (M, 3) barycentric coordinates of the match on its triangle.
+        nearest: (M,) vertex at which the walk to the match ended.
+        residual: (M,) distance by which the model lies beyond each point along the model's normal.
+        distance: (M,) distance of each point to its match.
+        allowed: (M,) False at the border of the model, and where the normals disagree.
     """
 
     triangle: IntArray
@@ -107,11 +107,11 @@ class VertexMatches:
     """Model vertices matched to the scan, (N,) each; residuals and distances in mm of the model's frame.
 
     Args:
-        vertex: which vertices.
-        residual: how far each lies beyond its match along the model's normal.
-        distance: to its match.
-        allowed: False on the border of the scan, and where the normals disagree.
-        near: the matches themselves, for the next search to begin with.
+        vertex: (N,) indices of the vertices.
+        residual: (N,) distance by which each vertex lies beyond its match along the model's normal.
+        distance: (N,) distance of each vertex to its match.
+        allowed: (N,) False on the border of the scan, and where the normals disagree.
+        near: closest points of the scan, from which the next search starts.
     """
 
     vertex: IntArray
@@ -123,12 +123,12 @@ class VertexMatches:
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """What is matched at one moment of a fit, both ways.
+    """Matches of an iterate in both directions.
 
     Args:
         points: scan points on the model (R4).
         vertices: model vertices on the scan (R5).
-        winding: -1 where the scan's normals are reversed, else 1.
+        winding: -1 if the scan's normals are reversed, else 1.
     """
 
     points: PointMatches
@@ -137,16 +137,16 @@ class Matches:
 
     @property
     def hint(self) -> MatchHint:
-        """For the next search of the same points and vertices."""
+        """Hint for the next search of the same points and vertices."""
         return MatchHint(self.points.nearest, self.points.triangle, self.vertices.near, self.winding)
 
     def residuals(self) -> FloatArray:
-        """Return the residuals of all matches that are allowed, both ways."""
+        """Return the residuals of all allowed matches, in both directions."""
         p, v = self.points, self.vertices
         return np.concatenate([p.residual[p.allowed], v.residual[v.allowed]])
 
     def weights(self, name: str, width_mm: float, far_mm: float, vertex_share: float) -> Weights:
-        """Return how much each counts (R8, R9): residuals against a width, distances against how far is far."""
+        """Return the weight of each match (R8, R9), with `width_mm` as scale of residuals and `far_mm` of distances."""
         p, v = self.points, self.vertices
         return Weights(
             match_weights(name, p.residual, p.distance, p.allowed, width_mm, far_mm),
@@ -166,7 +166,7 @@ class Matches:
         return Gathered(W, h, seen)
 
     def unexplained_variance(self, weights: Weights, faces: IntArray, vertices: int, seed: int) -> float:
-        """Return the variance, mm^2, of the part of the residuals that is no noise (R17); it can be below zero.
+        """Return the variance, mm^2, of the residuals without their noise (R17); it can be below zero.
 
         Scan points are split into two halves at random. Noise is independent between them, so the mean product of their
         mean residuals at a vertex is the variance of the remaining shape difference.
@@ -183,13 +183,13 @@ class Matches:
 
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """How much each match counts.
+    """Weights of the matches.
 
     Args:
-        points: (M,) of the scan's points,
-        vertices: (N,) and of the model's vertices.
-        width_mm: scale of the residuals that made them,
-        far_mm: and of the distances.
+        points: (M,) weights of the matches of the scan's points.
+        vertices: (N,) weights of the matches of the model's vertices.
+        width_mm: scale of the residuals for these weights, mm.
+        far_mm: scale of the distances for these weights, mm.
     """
 
     points: FloatArray
@@ -200,12 +200,12 @@ class Weights:
 
 @dataclass(frozen=True, eq=False)
 class Gathered:
-    """The matches as the model's vertices carry them, (V,) each.
+    """Matches gathered on the vertices of the model, (V,) each.
 
     Args:
-        W: sum of the weights of all matches at each vertex (R10).
-        h: sum of the weighted residuals there, mm (R10).
-        seen: True where a scan point with a positive weight is matched.
+        W: (V,) sum of the weights of all matches at each vertex (R10).
+        h: (V,) sum of the weighted residuals there, mm (R10).
+        seen: (V,) True where a scan point with a positive weight is matched.
     """
 
     W: FloatArray
@@ -215,13 +215,13 @@ class Gathered:
 
 @dataclass(frozen=True, eq=False)
 class MatchHint:
-    """Where the last search ended. It shortens the next search of the same points and vertices.
+    """End of the last search. It shortens the next search of the same points and vertices.
 
     Args:
-        vertex: (M,) of the model, near each scan point.
-        triangle: (M,) of the model, near each scan point; -1 where none is known.
-        near: closest points of the scan to the vertices; None where none are known.
-        winding: -1 where the scan's normals are reversed, else 1; None where it is not known.
+        vertex: (M,) vertex of the model near each scan point.
+        triangle: (M,) triangle of the model near each scan point; -1 if none is known.
+        near: closest points of the scan to the vertices; None if unknown.
+        winding: -1 if the scan's normals are reversed, else 1; None if unknown.
     """
 
     vertex: IntArray
@@ -236,14 +236,14 @@ class Matcher:
 
     Args:
         target: the scan.
-        points_mm: (M, 3) sample of its points, mm of the scan's frame.
-        point_normals: (M, 3) their normals.
-        order: (M,) of searches for the sample, in which neighbours follow each other. It changes only their time, as
-            what a search needs is then in the processor's cache.
+        points_mm: (M, 3) sample of the scan's points, in its mm frame.
+        point_normals: (M, 3) normals of these points.
+        order: (M,) order of searches for the sample, in which neighbours follow each other. It only reduces their time,
+            as the data of a search are then in the processor's cache.
         vertex: (N,) sample of the model's vertices.
-        engine: the scan's search structure.
-        normal_cosine: matches whose normals disagree more than this are not allowed.
-        bulging: whether flat triangles stand for the smooth surface through their corners.
+        engine: search structure of the scan.
+        normal_cosine: cosine of the largest angle between the normals of an allowed match.
+        bulging: whether flat triangles represent the smooth surface through their corners.
     """
 
     target: ScanTarget
@@ -284,7 +284,7 @@ class Matcher:
             surface: surface of the model.
             T_scan_model: pose of the model.
             tree: search tree of the vertices of a similar surface; None to build one.
-            winding: -1 where the normals of the scan are reversed, else 1; None if unknown.
+            winding: -1 if the normals of the scan are reversed, else 1; None if unknown.
         """
         tree = tree or surface.vertex_tree()
         vertex = np.empty(len(self.points_mm), dtype=np.int32)
@@ -317,14 +317,14 @@ class Matcher:
 
 
 def choose_bulging(matcher: Matcher, surface: ModelSurface, T_scan_model: Similarity, hint: MatchHint) -> Matcher:
-    """Return the matcher with triangles that stand for a smooth surface, or flat ones, as those of a simulated scan.
+    """Return the matcher for triangles of a smooth surface, or for flat triangles, such as those of a simulated scan.
 
     The residuals of the right choice have no pattern within triangles, and therefore the smaller spread.
     """
     tried = [replace(matcher, bulging=bulging) for bulging in (True, False)]
     spreads: list[float] = []
-    for one in tried:
-        points = one.match(surface, T_scan_model, hint).points
+    for candidate in tried:
+        points = candidate.match(surface, T_scan_model, hint).points
         residual = points.residual[points.allowed]
         spreads.append(spread(residual - np.median(residual)) if len(residual) else 0.0)
     return tried[int(np.argmin(spreads))]
@@ -338,13 +338,13 @@ def match_vertices(
 
     Args:
         target: the scan.
-        engine: one of its search structures.
-        T_scan_model: from the model's frame to the scan's mm frame.
-        surface: in the model's frame.
-        vertex: (N,) which to match.
-        near: what the last search for the same vertices found; None for the first.
-        winding: -1 where the scan's normals are reversed, else 1.
-        normal_cosine: matches whose normals disagree more than this are not allowed.
+        engine: search structure of the scan.
+        T_scan_model: pose of the model, from the model's frame to the scan's mm frame.
+        surface: surface in the model's frame.
+        vertex: (N,) indices of the vertices to match.
+        near: result of the last search for the same vertices; None for the first search.
+        winding: -1 if the scan's normals are reversed, else 1.
+        normal_cosine: cosine of the largest angle between the normals of an allowed match.
     """
     T, x, n = T_scan_model, surface.vertices[vertex], surface.normals[vertex]
     near = engine.query(T.apply(x), near)
@@ -358,5 +358,5 @@ def match_vertices(
 
 
 def _winding_of(cosine: FloatArray, covered: BoolArray) -> float:
-    """Return -1 where most normals of model and scan are opposed: a scan wound the wrong way round has all reversed."""
+    """Return -1 if most normals of model and scan are opposed: a wrong winding of the scan reverses all its normals."""
     return 1.0 if np.median(cosine[covered] if covered.any() else cosine) >= 0 else -1.0

@@ -1,9 +1,9 @@
-"""How well a robust fit knows what it found: the joint posterior of pose and coefficients, tempered and calibrated.
+"""Uncertainty of a robust fit: the joint posterior of pose and coefficients, tempered and calibrated.
 
 At the optimum the cost of `robust` is near quadratic, so the inverse of its Hessian is the covariance of pose,
-coefficients and residual modes together (Laplace). The block of b in the full inverse has the pose marginalised. Taken
-as it stands it is far too small, since residuals that share a cause are counted as independent. So the data's part of
-the Hessian is divided by a temperature before the prior joins it again: what the scan does not show stays at the prior.
+coefficients and residual modes together (Laplace). The block of b in the full inverse has the pose marginalised. This
+covariance is far too small, since residuals with a common cause are counted as independent. So the data's part of
+the Hessian is divided by a temperature before the prior is added again: unobserved parts stay at the prior.
 Equation numbers are those of docs/robust.md.
 """
 
@@ -37,7 +37,7 @@ class Estimate:
     """Pose and coefficients of an iterate.
 
     Args:
-        T_scan_model: from the model's frame to the scan's mm frame (R2).
+        T_scan_model: similarity from the model's frame to the scan's mm frame (R2).
         b: (K,) coefficients of all modes, mm.
     """
 
@@ -56,10 +56,10 @@ class Prior:
     """Normal prior of the coefficients and of the log scale (R13, R14).
 
     Args:
-        stddev: (K,) of each coefficient, mm.
+        stddev: (K,) standard deviation of each coefficient, mm.
         weight: alpha, weight of the prior relative to one match.
-        start_scale: s_0, scale of the start.
-        scale_stddev: of log(s / s_0); zero where the scale is held.
+        start_scale: s_0, the scale of the start.
+        scale_stddev: standard deviation of log(s / s_0); zero if the scale is fixed.
     """
 
     stddev: FloatArray
@@ -82,8 +82,8 @@ class NormalEquations:
     Args:
         H: (7 + k, 7 + k) Hessian of the matches (R12).
         D: (7 + k,) diagonal of the Hessian of the prior (R13, R14).
-        gradient: (7 + k,) g + e, of matches, prior and landmarks.
-        holds_scale: whether the scale is fixed, so that its row and column are left out.
+        gradient: (7 + k,) g + e, the gradient of matches, prior and landmarks.
+        holds_scale: whether the scale is fixed, so that its row and column are omitted.
         H_landmarks: (7 + k, 7 + k) Hessian of the landmarks with their gain (R16c); None without landmarks.
     """
 
@@ -125,10 +125,10 @@ def normal_equations(
     """Return the equations of one Gauss-Newton step on the pose and the first `modes` coefficients.
 
     Args:
-        surface: of the model, with the coefficients of `at`.
+        surface: surface of the model with the coefficients of `estimate`.
         gathered: weights and weighted residuals of the matches at each of its vertices.
-        prior: of coefficients and scale.
-        sigma_mm: spread of the residuals.
+        prior: prior of coefficients and scale.
+        sigma_mm: spread of the residuals, mm of the model's frame.
         estimate: pose and coefficients.
         modes: k, the number of free modes.
     """
@@ -152,7 +152,7 @@ def small_similarity(delta: FloatArray) -> Similarity:
     """Return S of R3 from `delta` (7,): omega (radians), tau (mm) and ds, about the origin."""
     x, y, z = delta[:3].tolist()
     angle = sqrt(x * x + y * y + z * z)
-    # The unit quaternion of the rotation, by a series where the quotient loses its digits.
+    # The unit quaternion of the rotation, by a series where the quotient loses precision.
     squared = angle * angle
     half = 0.5 - squared / 48 + squared * squared / 3840 if angle <= 1e-3 else sin(angle / 2) / angle
     x, y, z, w = x * half, y * half, z * half, cos(angle / 2)
@@ -166,25 +166,25 @@ def small_similarity(delta: FloatArray) -> Similarity:
     return Similarity(float(np.exp(delta[SCALE])), rotation, delta[3:6])
 
 
-# Chosen on the split "dev" of `benchmarks/calibration.py`, so that 68 % and 95 % of the truth lie where they should.
+# Chosen on the split "dev" of `benchmarks/calibration.py`, so that intervals of 68 % and 95 % contain these shares.
 NOISE_TEMPERATURE = 1.7
 # independent patches of a completely observed surface, as neighbouring residuals are correlated (R20a)
 PATCHES = 300.0
 _FEWEST_PATCHES = 100.0
 
-"""Of each model in use: it takes longer to find than the rest of the posterior."""
+"""Smallest number of independent patches; the expected error, on which the verdict was tuned, uses it throughout."""
 
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """What is known of pose and coefficients beside their values.
+    """Covariance of pose and coefficients, and the expected error of the surface.
 
     Args:
-        covariance: (7 + K + R, 7 + K + R) of turn (radians), shift (mm), log scale, the model's K coefficients and
-            those of R modes beside it (mm).
-        prior_variance: (K + R,) of the coefficients before the scan was seen, mm^2.
-        surface_mm: RMS over the vertices by which the fitted surface is expected to be off, by the darker view of what
-            the model lacks, on which the verdict was tuned.
+        covariance: (7 + K + R, 7 + K + R) covariance of rotation (radians), translation (mm), log scale, the model's K
+            coefficients and those of the R residual modes (mm).
+        prior_variance: (K + R,) variances of the coefficients in the prior, mm^2.
+        surface_mm: expected RMS error of the fitted surface over its vertices, mm of the model's frame, for the
+            smallest number of independent patches, on which the verdict was tuned.
     """
 
     covariance: FloatArray
@@ -215,17 +215,17 @@ def posterior(
     beyond_model_mm: float,
     allowed_share: float,
 ) -> Posterior:
-    """Return what is known at the end of a fit (R20-R22).
+    """Return the posterior at the end of a fit (R20-R22).
 
     Args:
-        model: the shape space.
-        surface: where it ended, with all modes that were free.
-        prior: that the fit went by.
-        equations: there.
-        weights: of the matches there.
-        sigma_mm: spread of the residuals there.
-        beyond_model_mm: RMS of what the model left of the residuals.
-        allowed_share: of the vertices whose match is no border and faces as the model does.
+        model: the shape model.
+        surface: final surface, with all modes that were free.
+        prior: prior of the fit.
+        equations: normal equations at the end.
+        weights: weights of the matches at the end.
+        sigma_mm: spread of the residuals at the end, mm of the model's frame.
+        beyond_model_mm: RMS of the residuals outside the model and without noise, mm of the model's frame.
+        allowed_share: share of the vertices whose match is not on a border and faces as the model does.
     """
     K, n = model.n_modes, POSE + len(prior.stddev)
     variance = np.concatenate([variance_of_new_shapes(model), prior.stddev[K:] ** 2])
@@ -234,17 +234,17 @@ def posterior(
         H[SCALE], H[:, SCALE] = 0.0, 0.0
     matches = float(weights.points.sum()) + float(weights.vertices.sum())
     size_mm = rms_size(model.mean_vertices)
-    # Scaled to standard deviations, so that one small damping suits turns, millimetres and coefficients alike.
+    # Scaled to standard deviations, so that one small damping suits rotations, translations and coefficients.
     scale_stddev = prior.scale_stddev or 1.0
     unit = np.concatenate([np.ones(3), np.full(3, size_mm), [scale_stddev], np.sqrt(variance)])
     prior_precision = np.concatenate([np.full(POSE - 1, 1e-9), np.ones(n - POSE + 1)])
 
     def covariance(patches: float) -> FloatArray:
-        # What the model lacks is shared by all matches of a patch, and noise nearly independent from match to match.
+        # All matches of a patch share the error of the model; noise is nearly independent from match to match.
         temperature = NOISE_TEMPERATURE + matches / patches * (beyond_model_mm / sigma_mm) ** 2  # R20
         scaled = H / temperature * np.outer(unit, unit)
         if equations.H_landmarks is not None:
-            # Weighed up in a step by what matches are worth, they are what they are beside tempered ones.
+            # In a step landmarks have a gain, relative to the matches; here the matches are tempered instead.
             scaled += equations.H_landmarks / (sigma_mm**2 * worth(matches)) * np.outer(unit, unit)
         scaled[np.diag_indices(n)] += prior_precision
         inverse = np.asarray(cho_solve(cho_factor(scaled, lower=True), np.eye(n)))  # R21
@@ -272,8 +272,8 @@ def covariance_of_landmarks(known: Posterior, surface: ModelSurface, landmarks: 
 def variance_of_new_shapes(model: ShapeModel) -> FloatArray:
     """Return the variance (K,), mm^2, that a shape outside the training set has along each mode.
 
-    Those of the model are taken as they are where they were found on shapes left out. Never below the model's own: a
-    spectrum of few modes tells no density, and what it foretells of them can be far too little.
+    Variances that were estimated on held-out shapes are used unchanged. The result is never below the model's own
+    variances: a spectrum of few modes determines no density, and its prediction can be far too small.
     """
     own = model.stddev**2
     if model.held_out:
@@ -282,11 +282,11 @@ def variance_of_new_shapes(model: ShapeModel) -> FloatArray:
 
 
 def lack_of_new_shapes(model: ShapeModel) -> float:
-    """Return how far, RMS over the vertices, mm, a new shape of the kind lies outside the model, by its spectrum.
+    """Return the RMS distance over the vertices, mm, of a new shape from the span of the model, from its spectrum.
 
     A training shape lies 1 / (G^-1)_ii outside the span of the others, G their Gram matrix; that is about N times the
-    harmonic mean of the variances. What modes that were cut off held comes on top. Where variances were found on shapes
-    left out, what they leave is what new shapes leave.
+    harmonic mean of the variances. The variance of discarded modes is added. If the variances were estimated on
+    held-out shapes, new shapes lie only these discarded modes outside the model.
     """
     spectrum = whole_spectrum(model.stddev**2, model.total_variance, model.n_training)
     left = float(spectrum[model.n_modes :].sum())
@@ -295,7 +295,7 @@ def lack_of_new_shapes(model: ShapeModel) -> float:
 
 
 def _gram(surface: ModelSurface) -> FloatArray:
-    """Return (7 + K + R, 7 + K + R): inner products over the surface of what each parameter moves."""
+    """Return the inner products (7 + K + R, 7 + K + R), over the surface, of the displacements by each parameter."""
     flat, modes = small_poses(surface.vertices), surface.modes
     gram = np.eye(POSE + modes.shape[2])
     gram[:POSE, :POSE] = flat.T @ flat

@@ -19,16 +19,16 @@ from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity, 
 
 @dataclass(frozen=True, eq=False)
 class Topology:
-    """Who neighbours whom on the model's surface.
+    """Neighbourhoods of the vertices on the model's surface.
 
     Args:
-        faces: (F, 3) int32.
-        ring_start: (V + 1,) where each vertex's neighbours start in `ring`.
-        ring: (R,) vertices.
-        fan_start: (V + 1,) where each vertex's triangles start in `fan`.
-        fan: (3F,) triangles.
+        faces: (F, 3) int32 triangles.
+        ring_start: (V + 1,) start of each vertex's neighbours in `ring`.
+        ring: (R,) neighbours of the vertices.
+        fan_start: (V + 1,) start of each vertex's triangles in `fan`.
+        fan: (3F,) triangles of the vertices.
         rim: (V,) True on the border of the surface.
-        used: indices of the vertices that some triangle has.
+        used: indices of the vertices that belong to a triangle.
     """
 
     faces: IntArray
@@ -65,15 +65,15 @@ class Topology:
 
 @dataclass(frozen=True, eq=False)
 class PreparedModel:
-    """What a fit needs of a model and every fit with it shares.
+    """Precomputed data of a model, shared by all fits with it.
 
     Args:
-        model: the shape space.
-        topology: of its surface.
-        tree: of the mean's vertices that some triangle has: entry i is vertex `used[i]` of the topology.
-        modes: (V, 3, K) float32 basis vectors: the rows of the normal equations are made from them.
-        pose: (3V, 7) what a small rotation, translation and scaling do to the mean.
-        pose_in_span: (K, 7) what of that the modes can do.
+        model: the shape model.
+        topology: topology of its surface.
+        tree: search tree of the mean's vertices that belong to a triangle: entry i is vertex `used[i]` of the topology.
+        modes: (V, 3, K) float32 basis vectors, from which the rows of the normal equations are made.
+        pose: (3V, 7) displacements of the mean by a small rotation, translation and scaling.
+        pose_in_span: (K, 7) components of these displacements along the modes.
     """
 
     model: ShapeModel
@@ -89,7 +89,7 @@ def prepare(model: ShapeModel) -> PreparedModel:
     """Return `model` with precomputed data for the robust fit, computed once for each model.
 
     Raises:
-        InputError: it has no triangles, so it has no normals.
+        InputError: the model has no triangles, so it has no normals.
     """
     if model.faces is None:
         raise InputError("The robust method needs a model with triangles; this one has none, so use --method paper.")
@@ -105,10 +105,10 @@ class ModelSurface:
     """A surface on the model's triangles, in the model's frame.
 
     Args:
-        topology: its triangles.
-        vertices: (V, 3) mm.
+        topology: topology of its triangles.
+        vertices: (V, 3) vertices, mm.
         normals: (V, 3) unit normals of the vertices.
-        modes: (V, 3, K) float32 in which it deforms; K is 0 where it is moved vertex by vertex.
+        modes: (V, 3, K) float32 modes of its deformation; K is 0 if it is moved vertex by vertex.
     """
 
     topology: Topology
@@ -118,14 +118,14 @@ class ModelSurface:
 
     @staticmethod
     def of(topology: Topology, vertices: FloatArray, modes: Float32Array | None = None) -> ModelSurface:
-        """Return the surface with these vertices (V, 3) mm, and the normals that follow from them."""
+        """Return the surface with these vertices (V, 3) mm, and their normals."""
         normals = np.empty_like(vertices)
         normals_into(vertices, topology.faces, normals)
         modes = np.empty((len(vertices), 3, 0), dtype=np.float32) if modes is None else modes
         return ModelSurface(topology, vertices, normals, modes)
 
     def vertex_tree(self) -> KdTree:
-        """Return a tree of the vertices that some triangle has: entry i is vertex `used[i]`."""
+        """Return a tree of the vertices that belong to a triangle: entry i is vertex `used[i]`."""
         return KdTree(self.vertices[self.topology.used])
 
     def closest(
@@ -134,9 +134,9 @@ class ModelSurface:
         """Find the closest points by walking over the surface from a vertex and a triangle near each.
 
         Args:
-            points: (M, 3) mm.
-            vertex: (M,) where each walk begins.
-            triangle: (M,) near it; -1 where none is known.
+            points: (M, 3) query points, mm.
+            vertex: (M,) vertex from which each walk starts.
+            triangle: (M,) triangle near it; -1 if none is known.
 
         Returns:
             (M,) vertex where each walk ends, (M,) triangle of the closest point, (M, 3) barycentric coordinates.
@@ -150,7 +150,7 @@ class ModelSurface:
     def meet(
         self, points: FloatArray, point_normals: FloatArray, triangle: IntArray, weights: FloatArray, *, bulging: bool
     ) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-        """Return (M,) residuals along the model's normal, distances, cosines of the normals, and what is no rim.
+        """Return (M,) residuals along the model's normal, distances, cosines of the normals, and the mask off the rim.
 
         With `bulging` residuals are from the smooth surface through the corners of each triangle.
         """
@@ -170,9 +170,9 @@ class LinearShape:
     """A linear shape model on fixed triangles (R1).
 
     Args:
-        topology: of all of them.
-        mean: (V, 3) mm.
-        modes: (V, 3, K) float32.
+        topology: topology of all surfaces of the shape model.
+        mean: (V, 3) vertices of the mean, mm.
+        modes: (V, 3, K) float32 modes.
     """
 
     topology: Topology
@@ -196,13 +196,14 @@ _WIDTH, _MAD, _FAR = 3.0, 1.48, 4.0
 
 @dataclass(frozen=True, eq=False)
 class LandmarkConstraint:
-    """Landmarks of a scan that the model has too.
+    """Landmarks that scan and model share.
 
     Args:
-        landmarks: L of them, on the model's surface.
-        points_mm: (L, 3) in the scan's mm frame.
-        stddev_mm: of each coordinate, mm of the scan.
-        far_mm: beyond three times this, mm of the model's frame, a landmark has no say, however far off all are.
+        landmarks: the L shared landmarks on the model's surface.
+        points_mm: (L, 3) positions in the scan's mm frame.
+        stddev_mm: standard deviation of each coordinate, mm of the scan.
+        far_mm: largest median distance, mm of the model's frame, to which the outlier limit adapts; a landmark over
+            three times as far off has no influence.
     """
 
     landmarks: SurfaceLandmarks
@@ -212,7 +213,7 @@ class LandmarkConstraint:
 
     @staticmethod
     def of(model: ShapeModel, landmarks_mm: Mapping[str, FloatArray], stddev_mm: float) -> LandmarkConstraint | None:
-        """Return those of `landmarks_mm` (name -> (3,)) that `model` has too; None where there are none."""
+        """Return those of `landmarks_mm` (name -> (3,)) that `model` has too; None if there are no such landmarks."""
         names = [name for name in model.landmarks if name in landmarks_mm]
         if not names or not np.isfinite(stddev_mm):
             return None
@@ -229,18 +230,18 @@ class LandmarkConstraint:
         return np.linalg.norm(T_scan_model.apply(positions) - self.points_mm, axis=1)
 
     def equations(self, surface: ModelSurface, T_scan_model: Similarity, modes: int) -> tuple[FloatArray, FloatArray]:
-        """Return Hessian (7 + k, 7 + k) and gradient (7 + k,) of half the squares over the variance, robustly weighed.
+        """Return Hessian (7 + k, 7 + k) and gradient (7 + k,) of half the squares over the variance, robustly weighted.
 
         Args:
-            surface: as it is now.
-            T_scan_model: where it is now, in the scan's mm frame.
-            modes: k, how many are free.
+            surface: current surface.
+            T_scan_model: current pose, in the scan's mm frame.
+            modes: k, the number of free modes.
         """
         x = self.landmarks.interpolate(surface.vertices)
         off = x - T_scan_model.inverse().apply(self.points_mm)
         distance = np.linalg.norm(off, axis=1)
         stddev = self.stddev_mm / T_scan_model.scale
-        # A wrong landmark lies far off beside the others, however far these are off on the way.
+        # A wrong landmark lies farther off than the others, even while all of them are off during the fit.
         width = _WIDTH * max(stddev, min(_MAD * float(np.median(distance)), self.far_mm))  # R16b
         weight = np.exp(-0.5 * (distance / width) ** 2) / stddev**2  # R16a
         pose = small_poses(x).reshape(len(x), 3, POSE)
@@ -251,16 +252,16 @@ class LandmarkConstraint:
         return hessian, np.asarray(heavy.T @ off.ravel(), dtype=np.float64)
 
     def notes(self, surface: ModelSurface, T_scan_model: Similarity) -> list[str]:
-        """Return a sentence on each landmark that lies where the fit does not have it."""
+        """Return a sentence on each landmark that the fit contradicts."""
         off_mm = self.off_mm(surface, T_scan_model)
         far = off_mm > _FAR * max(self.stddev_mm, _MAD * float(np.median(off_mm)))
         return [
-            f"Landmark {name!r} lies {off:.1f} mm from where the fit has it; check its place and its name."
+            f"Landmark {name!r} lies {off:.1f} mm from its position in the fit; check its position and its name."
             for name, off, is_far in zip(self.landmarks.names, off_mm, far, strict=True)
             if is_far
         ]
 
 
 def worth(matches: float) -> float:
-    """Return how many matches stand for one observation, by which landmarks are weighed up; `matches` is their sum."""
+    """Return the number of matches that count as one observation, the gain of landmarks; `matches` is their weight."""
     return max(1.0, matches / _PATCHES)

@@ -1,17 +1,17 @@
-"""Phase 2 as we would do it: pose and shape at once, from both directions, robustly, with the prior.
+"""Phase 2 of the robust method: pose and shape together, from matches in both directions, with the prior.
 
 One step minimises, over a small change of the pose and over the coefficients b, in the model's frame,
 
     sum_i w_i r_i^2 / sigma^2  +  alpha (sum_k b_k^2 / lam_k  +  log(s / s_0)^2 / sd_s^2)                   (R14a)
 
-where r_i is how far the model lies from a match along the model's own normal (Chen and Medioni, 1992), and alpha is
-the weight of what is known beforehand beside that of one match. Matches go both ways: each scan point to the closest
-point of the moving surface, and each model vertex to the closest point of the scan. Those on a border, with normals
-that disagree, or far off for the spread of the rest count little or nothing (Zhang, Yao and Deng, PAMI 2022). The
-second term is the prior (Blanz et al., 2004); the third keeps a scale that the scan hardly shows. Few modes are free
-at first and all in the end; where the scan then shows a shape that the model cannot make, the modes of `residual`
-join in, so that what the model lacks does not bend what it has. docs/robust.md derives it; equation numbers are those
-of that page.
+where r_i is the distance of the model from a match along the model's own normal (Chen and Medioni, 1992), and alpha is
+the weight of the prior relative to one match. Matches go both ways: each scan point to the closest
+point of the moving surface, and each model vertex to the closest point of the scan. Matches on a border, with normals
+that disagree, or with residuals large for their spread count little or nothing (Zhang, Yao and Deng, PAMI 2022). The
+second term is the prior (Blanz et al., 2004); the third constrains a scale that the scan hardly determines. Few modes
+are free at first and all at the end; if the scan then shows a shape outside the model, the modes of `residual` are
+added, so that the variation outside the model does not distort its own coefficients. docs/robust.md derives it and
+numbers the equations.
 """
 
 from __future__ import annotations
@@ -75,9 +75,10 @@ _FLICKER = 10.0  # multiple of the stop motion below which matches only alternat
 _CLEARLY_BETTER = 0.95  # ratio of mismatches for which an alternative replaces the current pose
 _FARTHEST = 5.0  # multiple of the reach beyond which points are not matched
 _HALF, _LEADING, _NEAR = 0.5, 10, 0.05
-"""A match counts at half weight; so many modes lead; near is this share of the model's size."""
+"""Weight above which a match counts, number of leading modes, and share of the model's size that counts as near."""
 _LACK_LEFT = 0.5
-"""Of the variance outside the model, so that landmarks lie within their standard deviations (docs/landmarks.md)."""
+"""Share of the variance outside the model that is added, so that landmarks lie within their standard deviations
+(docs/landmarks.md)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +87,7 @@ class Iterate:
 
     Args:
         estimate: pose and coefficients.
-        surface: of the model, with these coefficients (R1).
+        surface: surface of the model with these coefficients (R1).
     """
 
     estimate: Estimate
@@ -94,12 +95,12 @@ class Iterate:
 
     @property
     def T_scan_model(self) -> Similarity:
-        """From the model's frame to the scan's mm frame."""
+        """Similarity from the model's frame to the scan's mm frame."""
         return self.estimate.T_scan_model
 
     @property
     def b(self) -> FloatArray:
-        """Coefficients (K,), mm."""
+        """(K,) coefficients, mm."""
         return self.estimate.b
 
 
@@ -108,9 +109,9 @@ class WeightedMatches:
     """Matches of an iterate with their weights.
 
     Args:
-        matches: both ways.
-        weights: of the matches.
-        sigma_mm: spread of their residuals.
+        matches: matches in both directions.
+        weights: weights of the matches.
+        sigma_mm: spread of their residuals, mm of the model's frame.
     """
 
     matches: Matches
@@ -129,7 +130,7 @@ class Step:
 
     Args:
         weighted: the matches that the step used.
-        iterate: where it led.
+        iterate: iterate after the step.
         motion_mm: largest movement of a vertex, mm of the model's frame.
     """
 
@@ -145,9 +146,9 @@ class Problem:
     Args:
         prepared: the model.
         target: the scan.
-        settings: of the method.
-        prior: of pose and shape.
-        shape: the surfaces that the coefficients give.
+        settings: settings of the method.
+        prior: prior of pose and shape.
+        shape: shape model that computes surfaces from coefficients.
         marks: landmarks, if any.
     """
 
@@ -169,7 +170,7 @@ class Problem:
         return Problem(prepared, target, settings, prior, shape, marks)
 
     def with_residual_modes(self) -> Problem:
-        """Return the problem with the residual modes as well, which `beyond_prior` weighs."""
+        """Return the problem with the residual modes as well, with the weight `beyond_prior`."""
         prepared, s = self.prepared, self.settings
         extra = residual_modes(prepared.model, s.residual)
         prior = replace(self.prior, stddev=np.concatenate([self.prior.stddev, extra.stddev]), weight=s.beyond_prior)
@@ -183,7 +184,7 @@ class Problem:
         """Return the matcher of the points and vertices that `level` samples."""
         s, target, rng = self.settings, self.target, np.random.default_rng(self.settings.seed)
         points = target.draw(level.scan_points, rng)
-        vertex = _some(self.prepared.topology.used, level.vertices, rng)
+        vertex = _sample_indices(self.prepared.topology.used, level.vertices, rng)
         engine = target.engine if level.triangles else target.vertex_engine
         return Matcher.of(target=target, points=points, vertex=vertex, engine=engine, normal_cosine=s.normal_cosine)
 
@@ -191,7 +192,7 @@ class Problem:
         """Return the matches of an iterate with their weights (R4-R9).
 
         Raises:
-            FitError: hardly anything matches.
+            FitError: hardly any point matches.
         """
         return self.weigh(matcher.match(iterate.surface, iterate.T_scan_model, hint))
 
@@ -199,14 +200,14 @@ class Problem:
         """Return the matches with their weights (R7-R9).
 
         Raises:
-            FitError: hardly anything matches.
+            FitError: hardly any point matches.
         """
         s = self.settings
         residual = matches.residuals()
         if len(residual) < _FEWEST_MATCHES:
             raise FitError(
                 f"{self.target.mesh.name}: hardly any of it matches the model from this start; give landmarks "
-                "(--landmarks), or check that it shows what the model does."
+                "(--landmarks), or check that it shows the object of the model."
             )
         sigma_mm = max(spread(residual), s.least_spread_mm)  # R6a
         width_mm = sigma_mm * min(s.wide, max(s.narrow, s.wide / tails(residual, sigma_mm) ** 2))  # R7
@@ -217,7 +218,7 @@ class Problem:
         return WeightedMatches(matches, weights, sigma_mm)
 
     def equations(self, weighted: WeightedMatches, iterate: Iterate, modes: int) -> tuple[Gathered, NormalEquations]:
-        """Return what each vertex carries of the matches, and the normal equations of a step (R10-R14)."""
+        """Return the matches gathered on the vertices, and the normal equations of a step (R10-R14)."""
         surface = iterate.surface
         gathered = weighted.matches.gathered(weighted.weights, self.prepared.topology.faces, len(surface.vertices))
         equations = normal_equations(surface, gathered, self.prior, weighted.sigma_mm, iterate.estimate, modes)
@@ -232,7 +233,7 @@ class Problem:
         """Return one Gauss-Newton step on the pose and the first `modes` coefficients.
 
         Raises:
-            FitError: hardly anything matches, or the fit diverged.
+            FitError: hardly any point matches, or the fit diverged.
         """
         weighted = self.match(matcher, iterate, hint)  # R4-R9
         _, equations = self.equations(weighted, iterate, modes)  # R10-R14
@@ -241,10 +242,10 @@ class Problem:
         except LinAlgError as error:
             raise FitError(
                 f"{self.target.mesh.name}: the fit diverged; give landmarks (--landmarks), or crop the scan to "
-                "what the model shows (--crop)."
+                "the part that the model contains (--crop)."
             ) from error
         estimate = iterate.estimate.moved_by(delta)  # R16
-        # Without free modes the shape stays as it is.
+        # Without free modes the shape stays unchanged.
         following = self.iterate(estimate) if modes else replace(iterate, estimate=estimate)
         some = slice(None, None, _MOTION_STRIDE)
         before = iterate.T_scan_model.apply(iterate.surface.vertices[some])
@@ -253,10 +254,10 @@ class Problem:
         return Step(weighted, following, motion_mm)
 
     def descent(self, matcher: Matcher, iterate: Iterate, hint: MatchHint, level: Level) -> Generator[Step]:
-        """Yield steps with the modes that are free on `level`, until hardly anything moves.
+        """Yield steps with the modes that are free on `level`, until the motion is below its limit.
 
         Raises:
-            FitError: hardly anything matches, or the fit diverged.
+            FitError: hardly any point matches, or the fit diverged.
         """
         modes = level.free(len(iterate.b))
         for _ in range(level.iterations):
@@ -276,8 +277,8 @@ class Problem:
         """Return the pose and the first `modes` of the model's own coefficients of an iterate (R18, R19).
 
         Args:
-            iterate: of the fit, with residual modes or without.
-            surface_mm: uncertainty of its surface, RMS over the vertices.
+            iterate: iterate of the fit, with residual modes or without.
+            surface_mm: uncertainty of its surface, RMS over the vertices, mm of the model's frame.
             modes: number of coefficients.
         """
         own = self.prepared.model.n_modes
@@ -290,20 +291,20 @@ class Problem:
         )  # fmt: skip
 
     def mismatch_mm(self, matches: Matches) -> float:
-        """Return the mean distance in both directions, mm, each distance cut at the reach."""
+        """Return the mean distance in both directions, mm, each distance capped at the reach."""
         most = _FARTHEST * self.settings.reach_mm
         return sum(float(np.minimum(way.distance, most).mean()) for way in (matches.points, matches.vertices))
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
-    """Where the iterations of the levels led.
+class LevelState:
+    """State after the iterations of some levels.
 
     Args:
-        iterate: the last one.
-        state: of it, which is not yielded yet.
-        matcher: of the last level.
-        hint: for its next search.
+        iterate: the last iterate.
+        state: state of the last iterate, which is not yielded yet.
+        matcher: matcher of the last level.
+        hint: hint for the next search of the matcher.
     """
 
     iterate: Iterate
@@ -325,18 +326,18 @@ def robust_icp(
     """Yield the states of the robust fit: phase 1 with the pose alone, phase 2 with pose and shape together.
 
     Args:
-        model: the shape space, with triangles.
+        model: the shape model, with triangles.
         target: the scan.
-        start: a pose of the mean near the scan, and coefficients where it has some.
-        settings: of the method.
-        with_scale: False holds the scale of the start.
-        modes: how many coefficients to report; None for all. The fit uses all in any case: modes left out of the fit
-            bend those that stay.
+        start: a pose of the mean near the scan, and coefficients if it has any.
+        settings: settings of the method.
+        with_scale: whether the scale is free; False fixes the scale of the start.
+        modes: number of coefficients to report; None for all. The fit uses all modes in any case: modes that are
+            excluded from a fit distort the others.
         max_iterations: cap of each phase.
 
     Raises:
         InputError: the model has no triangles.
-        FitError: hardly anything matches, or the fit diverged.
+        FitError: hardly any point matches, or the fit diverged.
     """
     scale = start.T_scan_model.scale
     problem = Problem.of(prepare(model), target, settings, scale, with_scale=with_scale, marks=start.marks)
@@ -346,82 +347,84 @@ def robust_icp(
         matcher, iterate, matcher.first_hint(iterate.surface, iterate.T_scan_model, problem.prepared.tree)
     )
     state = IcpState(1, 0, iterate.T_scan_model, iterate.b, first.rms_mm, float("inf"))
-    course = Course(iterate, state, matcher, first.matches.hint)
-    course, tree = yield from _coarse_to_fine(problem, course, start, max_iterations)
-    weighted = problem.match(course.matcher, course.iterate, course.hint)
+    progress = LevelState(iterate, state, matcher, first.matches.hint)
+    progress, tree = yield from _coarse_to_fine(problem, progress, start, max_iterations)
+    weighted = problem.match(progress.matcher, progress.iterate, progress.hint)
     unexplained_mm2 = problem.unexplained_variance(weighted)  # R17
     least_mm2 = max(settings.beyond_share * weighted.sigma_mm**2, settings.beyond_mm**2)  # R17a
-    if unexplained_mm2 >= least_mm2 and course.state.iteration < max_iterations:
+    if unexplained_mm2 >= least_mm2 and progress.state.iteration < max_iterations:
         problem = problem.with_residual_modes()
-        course = yield from _extended(problem, course, tree, max_iterations)
-        weighted = problem.match(course.matcher, course.iterate, course.hint)
-    yield course.state
-    return _summary(problem, course.iterate, weighted, unexplained_mm2, modes)
+        progress = yield from _extend_with_residual_modes(problem, progress, tree, max_iterations)
+        weighted = problem.match(progress.matcher, progress.iterate, progress.hint)
+    yield progress.state
+    return _summarise(problem, progress.iterate, weighted, unexplained_mm2, modes)
 
 
 def _coarse_to_fine(
-    problem: Problem, course: Course, start: Start, max_iterations: int
-) -> Generator[IcpState, None, tuple[Course, KdTree]]:
-    """Fit on all levels with the model's modes; return where that led, and a tree of the vertices for hints."""
-    prepared, levels, winding = problem.prepared, problem.settings.levels, course.hint.winding
+    problem: Problem, progress: LevelState, start: Start, max_iterations: int
+) -> Generator[IcpState, None, tuple[LevelState, KdTree]]:
+    """Fit on all levels with the model's modes; return the end, and a tree of the vertices for hints."""
+    prepared, levels, winding = problem.prepared, problem.settings.levels, progress.hint.winding
     tree, tree_fits, sample = prepared.tree, False, levels[0].sample
     for level in levels:
-        begins = level.modes != 0 and course.state.phase == 1
+        begins = level.modes != 0 and progress.state.phase == 1
         if begins:
-            yield replace(course.state, stopped=course.state.stopped or "rate")
-            course = replace(course, state=replace(course.state, phase=2, iteration=0, stopped=None))
-        iterate = course.iterate
-        # The surface changes little from level to level; the walks make up for it.
+            yield replace(progress.state, stopped=progress.state.stopped or "rate")
+            progress = replace(progress, state=replace(progress.state, phase=2, iteration=0, stopped=None))
+        iterate = progress.iterate
+        # The surface changes little from level to level; the walks correct for the change.
         if level.modes is None and not tree_fits:
             tree, tree_fits = tree.moved(iterate.surface.vertices[prepared.topology.used]), True
         same = level.sample == sample
-        matcher, sample = course.matcher if same else problem.matcher(level), level.sample
+        matcher, sample = progress.matcher if same else problem.matcher(level), level.sample
         hint = matcher.first_hint(iterate.surface, iterate.T_scan_model, tree, winding)
-        hint = replace(hint, near=course.hint.near) if same else hint
+        hint = replace(hint, near=progress.hint.near) if same else hint
         steps = problem.descent(matcher, iterate, hint, level)
-        course = yield from _states(steps, replace(course, matcher=matcher, hint=hint), level, max_iterations)
-        if begins and len(start.b) and course.state.iteration < max_iterations:
-            course = replace(course, iterate=_preferred(problem, course, start, level, tree))
-    return course, tree
+        progress = yield from _yield_states(steps, replace(progress, matcher=matcher, hint=hint), level, max_iterations)
+        if begins and len(start.b) and progress.state.iteration < max_iterations:
+            progress = replace(progress, iterate=_choose_iterate(problem, progress, start, level, tree))
+    return progress, tree
 
 
-def _preferred(problem: Problem, course: Course, start: Start, level: Level, tree: KdTree) -> Iterate:
-    """Return where `level` leads from `start` and its coefficients if that matches clearly better, else the iterate."""
+def _choose_iterate(problem: Problem, progress: LevelState, start: Start, level: Level, tree: KdTree) -> Iterate:
+    """Return the end of `level` from `start` if it matches clearly better than the iterate, else the iterate."""
 
     def mismatch_mm(iterate: Iterate, matcher: Matcher, hint: MatchHint) -> float:
         return problem.mismatch_mm(matcher.match(iterate.surface, iterate.T_scan_model, hint))
 
-    limit_mm = _CLEARLY_BETTER * mismatch_mm(course.iterate, course.matcher, course.hint)
-    free, b = level.free(len(course.iterate.b)), np.zeros(len(course.iterate.b))
+    limit_mm = _CLEARLY_BETTER * mismatch_mm(progress.iterate, progress.matcher, progress.hint)
+    free, b = level.free(len(progress.iterate.b)), np.zeros(len(progress.iterate.b))
     b[: min(len(start.b), free)] = start.b[:free]
-    other, matcher = problem.iterate(Estimate(start.T_scan_model, b)), course.matcher
+    other, matcher = problem.iterate(Estimate(start.T_scan_model, b)), progress.matcher
     hint = matcher.first_hint(other.surface, other.T_scan_model, tree)
     for step in problem.descent(matcher, other, hint, level):
         other, hint = step.iterate, step.weighted.matches.hint
-    return other if mismatch_mm(other, matcher, hint) <= limit_mm else course.iterate
+    return other if mismatch_mm(other, matcher, hint) <= limit_mm else progress.iterate
 
 
-def _extended(problem: Problem, course: Course, tree: KdTree, max_iterations: int) -> Generator[IcpState, None, Course]:
+def _extend_with_residual_modes(
+    problem: Problem, progress: LevelState, tree: KdTree, max_iterations: int
+) -> Generator[IcpState, None, LevelState]:
     """Continue with the residual modes of `problem`, whose coefficients begin at zero."""
-    level, own = problem.settings.beyond, course.iterate.b
+    level, own = problem.settings.beyond, progress.iterate.b
     b = np.pad(own, (0, len(problem.prior.stddev) - len(own)))
-    iterate, matcher = problem.iterate(Estimate(course.iterate.T_scan_model, b)), problem.matcher(level)
-    hint = matcher.first_hint(iterate.surface, iterate.T_scan_model, tree, course.hint.winding)
+    iterate, matcher = problem.iterate(Estimate(progress.iterate.T_scan_model, b)), problem.matcher(level)
+    hint = matcher.first_hint(iterate.surface, iterate.T_scan_model, tree, progress.hint.winding)
     steps = problem.descent(matcher, iterate, hint, level)
-    return (yield from _states(steps, Course(iterate, course.state, matcher, hint), level, max_iterations))
+    return (yield from _yield_states(steps, LevelState(iterate, progress.state, matcher, hint), level, max_iterations))
 
 
-def _summary(
+def _summarise(
     problem: Problem, iterate: Iterate, weighted: WeightedMatches, unexplained_mm2: float, modes: int | None
 ) -> RobustFitted:
     """Return the result: coefficients of the model, their covariance, regions and evidence.
 
     Args:
-        problem: of the fit.
-        iterate: the last one.
-        weighted: its matches.
-        unexplained_mm2: variance of the residuals that is not noise, before residual modes joined (R17).
-        modes: how many coefficients to report; None for all.
+        problem: problem of the fit.
+        iterate: the last iterate.
+        weighted: weighted matches of the last iterate.
+        unexplained_mm2: variance of the residuals that is not noise, before residual modes were added (R17).
+        modes: number of coefficients to report; None for all.
     """
     model, target, settings = problem.prepared.model, problem.target, problem.settings
     gathered, equations = problem.equations(weighted, iterate, len(iterate.b))
@@ -437,7 +440,7 @@ def _summary(
             f"{target.mesh.name}: the matches do not determine the pose; check the scan's unit (--unit), or give "
             "landmarks (--landmarks)."
         ) from error
-    # Modes that are not reported are no reason to doubt the fit, so the verdict is on all of them.
+    # Modes that are not reported are no reason to doubt the fit, so the verdict uses all modes.
     all_regions = reported = problem.in_model(iterate, known.surface_mm, model.n_modes)
     wanted = model.n_modes if modes is None else min(modes, model.n_modes)
     if wanted < model.n_modes:
@@ -465,46 +468,46 @@ def _summary(
             far_mm=weighted.weights.far_mm,
         ),
         match_evidence=MatchEvidence(
-            **_matched(weighted, gathered, iterate, model, known.prior_variance[: model.n_modes]),
+            **_match_shares(weighted, gathered, iterate, model, known.prior_variance[: model.n_modes]),
             beyond_model_mm=T.scale * beyond_mm,
             left_out_mm=T.scale * float(np.sqrt(left_out_mm2)),
             model_spread_mm=T.scale * float(np.sqrt((model.stddev**2).sum() / model.n_vertices)),
             model_lack_mm=T.scale * lack_of_new_shapes(model),
-            **_of_marks(problem, iterate),
+            **_landmark_evidence(problem, iterate),
             posterior_error_mm=T.scale * float(np.hypot(known.surface_mm, np.sqrt(left_out_mm2))),
         ),
         notes=() if problem.marks is None else problem.marks.notes(surface, T),
-        landmark_covariance=_of_landmarks(model, known, surface, T),
+        landmark_covariance=_landmark_covariance(model, known, surface, T),
     )  # fmt: skip
 
 
-def _of_marks(problem: Problem, iterate: Iterate) -> dict[str, float]:
-    """Return the standard deviation of landmarks that were given, and how far off they are (RMS), mm of the scan."""
+def _landmark_evidence(problem: Problem, iterate: Iterate) -> dict[str, float]:
+    """Return the standard deviation of the given landmarks, and their RMS distance from the fit, mm of the scan."""
     if problem.marks is None:
         return {}
     off_mm = problem.marks.off_mm(iterate.surface, iterate.T_scan_model)
     return {"marks_stddev_mm": problem.marks.stddev_mm, "marks_rms_mm": float(np.sqrt((off_mm**2).mean()))}
 
 
-def _of_landmarks(model: ShapeModel, known: Posterior, surface: ModelSurface, T: Similarity) -> FloatArray:
-    """Return the covariance (L, 3, 3) of the model's landmarks in the frame that `T` leads to, mm^2."""
+def _landmark_covariance(model: ShapeModel, known: Posterior, surface: ModelSurface, T: Similarity) -> FloatArray:
+    """Return the covariance (L, 3, 3) of the model's landmarks in the target frame of `T`, mm^2."""
     covariance = covariance_of_landmarks(known, surface, model.landmarks)
-    # No mode moves a landmark by what new shapes have outside the model, of which the scan shows about a half.
+    # No mode represents the displacement of a landmark outside the model, about half of which the scan shows.
     covariance += np.eye(3) * _LACK_LEFT * lack_of_new_shapes(model) ** 2 / 3.0
     return T.scale**2 * T.rotation @ covariance @ T.rotation.T
 
 
-def _matched(
+def _match_shares(
     weighted: WeightedMatches, gathered: Gathered, iterate: Iterate, model: ShapeModel, variance: FloatArray
 ) -> dict[str, float]:
-    """Return how much of model and scan found a match, and how plausible pose and shape are.
+    """Return the shares of model and scan that match, and the plausibility of pose and shape.
 
     Args:
         weighted: matches of the last iterate.
-        gathered: what each vertex carries of them.
-        iterate: the last one.
-        model: the shape space.
-        variance: (K,) of the coefficients of new shapes, mm^2.
+        gathered: the matches gathered on the vertices.
+        iterate: the last iterate.
+        model: the shape model.
+        variance: (K,) variances of the coefficients of new shapes, mm^2.
     """
     points, vertices, v = weighted.matches.points, weighted.matches.vertices, weighted.weights.vertices
     size_mm, z2 = rms_size(model.mean_vertices), iterate.b[: model.n_modes] ** 2 / variance
@@ -524,16 +527,16 @@ def _matched(
     }
 
 
-def _states(
-    steps: Iterator[Step], course: Course, level: Level, max_iterations: int
-) -> Generator[IcpState, None, Course]:
-    """Yield each state when the next one is known; return where the steps led, with the last state."""
-    state = course.state
+def _yield_states(
+    steps: Iterator[Step], progress: LevelState, level: Level, max_iterations: int
+) -> Generator[IcpState, None, LevelState]:
+    """Yield each state when the next one is computed; return the end of the steps, with the last state."""
+    state = progress.state
     left = max_iterations - state.iteration
     for step in islice(steps, left):
         yield replace(state, stopped=None)
         T, b = step.iterate.T_scan_model, step.iterate.b[: len(state.b)].copy()
-        # Where parts of the scan match now one way and now another, the last bit of motion never ends.
+        # If parts of the scan alternate between two matches, a small motion never ends.
         still = step.motion_mm < _FLICKER * level.stop_motion_mm
         stopped = "rate" if still else "cap"
         state = IcpState(
@@ -545,22 +548,22 @@ def _states(
             motion_mm=step.motion_mm * T.scale,
             stopped=stopped,
         )
-        course = replace(course, iterate=step.iterate, hint=step.weighted.matches.hint)
-    return replace(course, state=state if left > 0 else replace(state, stopped="cap"))
+        progress = replace(progress, iterate=step.iterate, hint=step.weighted.matches.hint)
+    return replace(progress, state=state if left > 0 else replace(state, stopped="cap"))
 
 
-def _some(index: IntArray, count: int | None, rng: np.random.Generator) -> IntArray:
+def _sample_indices(index: IntArray, count: int | None, rng: np.random.Generator) -> IntArray:
     return index if count is None or count >= len(index) else np.sort(rng.choice(index, count, replace=False))
 
 
-# How a robust fit ended at each vertex of the model, found when it is asked for
+# Region of each vertex of the model at the end of a robust fit, computed on demand
 
 _COUNTS = 0.5
-"""A match that counts less than this was left out, in the main."""
+"""Weight of a match below which it counts as rejected."""
 _SPACINGS = 4.0
-"""Nearest points of a cloud lie to the side by half its spacing as a rule; so many times that is a hole."""
+"""Number of spacings of a point cloud from which on a sideways distance is a hole; half a spacing is usual."""
 _FINEST = 0.01
-"""Of the model's size: what lies nearer than this is followed, however exact the rest is."""
+"""Share of the model's size; the model follows points nearer than this, however exact the rest is."""
 
 
 def final_regions(
@@ -572,9 +575,9 @@ def final_regions(
     Args:
         target: the scan.
         T_scan_model: the final pose, in the scan's mm frame.
-        surface: the final one, in the model's frame.
-        winding: -1 where the scan's normals are reversed, else 1.
-        normal_cosine: matches whose normals disagree more than this do not count.
+        surface: final surface, in the model's frame.
+        winding: -1 if the scan's normals are reversed, else 1.
+        normal_cosine: cosine of the largest angle between the normals of a match that counts.
         weight: name of the weight.
         width_mm: scale of the residuals at the end.
         far_mm: scale of the distances at the end.
@@ -595,7 +598,7 @@ def final_regions(
     sideways = np.sqrt(np.maximum(matches.distance**2 - matches.residual**2, 0.0))
     counted = (w > _COUNTS) | (matches.allowed & (np.abs(matches.residual) < near_mm))
     regions = np.where(counted, FOLLOWED, REJECTED)
-    # Where the nearest point of the scan lies off to the side, the scan has nothing at the vertex itself.
+    # A nearest point of the scan off to the side shows that the scan has a hole at the vertex.
     regions[sideways > max(far_mm, _SPACINGS * float(np.median(sideways)))] = UNSEEN
     at_rim = on_boundary(matches.near, target.mesh, target.rim)
     regions[at_rim] = np.where(sideways[at_rim] > near_mm, UNSEEN, BORDER)
@@ -617,17 +620,17 @@ def in_span(
 ) -> Estimate:
     """Return the likeliest pose and first `modes` coefficients given the surface `vertices` (R18, R19).
 
-    Ordinary least squares would give weak modes, and modes close to motions of the pose, large coefficients for a
-    negligible gain; the prior keeps them plausible.
+    Ordinary least squares would assign large coefficients to weak modes, and to modes close to motions of the pose, for
+    a negligible gain; the prior keeps them plausible.
 
     Args:
         prepared: the model.
-        vertices: (V, 3) in the model's order, in its frame.
-        estimate: pose of that frame in the scan's; what the modes left out have done to the pose is given back to it.
-        prior_stddev: (K,) of the coefficients, mm.
-        uncertainty_mm: how well the surface is known, RMS over its vertices.
-        modes: how many.
-        with_scale: False keeps the scale.
+        vertices: (V, 3) vertices in the model's order and frame.
+        estimate: pose of that frame in the scan's mm frame, which is corrected for the effect of the excluded modes.
+        prior_stddev: (K,) standard deviations of the coefficients in the prior, mm.
+        uncertainty_mm: uncertainty of the surface, RMS over its vertices, mm of the model's frame.
+        modes: number of modes.
+        with_scale: whether the scale is free; False keeps the scale.
     """
     P, free = prepared.model.vertex_basis[:, :modes], POSE if with_scale else POSE - 1
     pose, inside = prepared.pose[:, :free], prepared.pose_in_span[:modes, :free]
@@ -635,7 +638,7 @@ def in_span(
     kept_share = prior_stddev[:modes] ** 2 / (prior_stddev[:modes] ** 2 + noise)
     y = (vertices - prepared.model.mean_vertices).ravel()
     b = P.T @ y
-    # What leaves the span may have moved the pose as far as it reaches itself, and hardly further.
+    # The part outside the span may have moved the pose about as far as the size of this part, and hardly further.
     residual_energy = max(float(y @ y - b @ b), 0.0) + len(y) * noise
     unit = 1.0 / np.linalg.norm(pose, axis=0)
     normal = (pose.T @ pose - (inside.T * kept_share) @ inside) * np.outer(unit, unit)

@@ -1,4 +1,4 @@
-"""The robust fit as a method: its settings, and what is doubted and said of it."""
+"""The robust fit as a method: its settings, its doubts and its reason."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from shapespace.fit.diagnostics.failure_model import (
 )
 from shapespace.fit.diagnostics.reasons import Reason
 from shapespace.fit.iteration_state import SHOWN, Fitted, IcpState, RobustFitted
-from shapespace.fit.method import Ended, Limits
+from shapespace.fit.method import FitOutcome, Limits
 from shapespace.fit.robust.robust_settings import RobustSettings
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.search.initialisation import Start
@@ -35,7 +35,7 @@ def _missing_part(
 ) -> tuple[float, float]:
     """Return the share of the vertices that a partial scan does not show, and their expected error, mm of the scan.
 
-    Zero for complete scans, and for models without training shapes, by which it is estimated.
+    Zero for complete scans, and for models without training shapes, which the estimate needs.
     """
     from shapespace.fit.completion.surface_calibration import missing_error_mm  # compiled
 
@@ -51,7 +51,7 @@ def _missing_part(
 
 @dataclass(frozen=True)
 class Robust(RobustSettings):
-    """Pose and shape at once, from both directions, robustly, with the prior (docs/robust.md).
+    """Pose and shape together, from matches in both directions, robustly, with the prior (docs/robust.md).
 
     Its settings are those of `RobustSettings`.
 
@@ -112,13 +112,13 @@ class Robust(RobustSettings):
             evidence = replace(evidence, **asdict(displaced))
         return replace(fitted, evidence=evidence, notes=notes)
 
-    def doubts(self, ended: Ended) -> list[Reason]:
+    def doubts(self, ended: FitOutcome) -> list[Reason]:
         """Return reasons in the evidence to doubt the fit: an odd scan, then a probable failure."""
         evidence = ended.fitted.evidence
         assert evidence is not None
         return [*find_odd_scan_reasons(evidence), *find_failure_reasons(evidence)]
 
-    def reason(self, ended: Ended) -> Reason:
+    def reason(self, ended: FitOutcome) -> Reason:
         """Return that the fit converged, with its robust residual standard deviation."""
         evidence = ended.fitted.evidence
         assert evidence is not None

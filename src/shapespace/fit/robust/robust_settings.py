@@ -1,4 +1,4 @@
-"""Every setting of the robust method, in one place."""
+"""All settings of the robust method."""
 
 from __future__ import annotations
 
@@ -7,13 +7,15 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class ResidualSettings:
-    """How far a shape may leave its model.
+    """Settings of the residual modes, the variation outside the model.
 
     Args:
-        count: modes beside the model's own, at most.
-        range_share: over what share of the model's size (RMS distance from its centre) the covariance is damped.
-        local_share: variance of the local modes as a share of the model's own.
-        mirror_share: the same of the mirrored modes, for means that are their own mirror image.
+        count: maximum number of residual modes in addition to the model's own.
+        range_share: range over which the covariance is damped, as a share of the model's size (RMS distance from its
+            centre).
+        local_share: variance of the local modes as a share of the variance of the model's own.
+        mirror_share: variance of the mirrored modes as a share of the variance of the model's own, for means that are
+            their own mirror image.
     """
 
     count: int = 300
@@ -27,12 +29,13 @@ class Level:
     """One step from coarse to fine.
 
     Args:
-        modes: how many are free; None for all; 0 is phase 1.
-        scan_points: how many points of the scan are matched; None for all.
-        vertices: how many of the model's vertices are matched; None for all.
-        triangles: those vertices are matched to the scan's triangles; False for its nearest vertices, which is faster.
-        iterations: at most.
-        stop_motion_mm: it ends when no vertex moves more than this, mm.
+        modes: number of free modes; None for all; 0 is phase 1.
+        scan_points: number of points of the scan that are matched; None for all.
+        vertices: number of the model's vertices that are matched; None for all.
+        triangles: whether those vertices are matched to the scan's triangles; False for its nearest vertices, which is
+            faster.
+        iterations: maximum number of iterations.
+        stop_motion_mm: largest movement of a vertex, mm, at which the level ends.
     """
 
     modes: int | None
@@ -44,37 +47,38 @@ class Level:
 
     @property
     def sample(self) -> tuple[int | None, int | None, bool]:
-        """What is matched, and to what; levels with the same one share a matcher."""
+        """Sample and target of the matches; levels with the same sample share a matcher."""
         return self.scan_points, self.vertices, self.triangles
 
     def free(self, modes: int) -> int:
-        """Return how many of `modes` are free."""
+        """Return the number of free modes, at most `modes`."""
         return modes if self.modes is None else min(self.modes, modes)
 
 
 @dataclass(frozen=True)
 class RobustSettings:
-    """Settings of the robust method; the defaults were chosen by `benchmarks/sweep.py` on people of their own.
+    """Settings of the robust method; the defaults were chosen by `benchmarks/sweep.py` on separate people.
 
     Args:
-        levels: from coarse to fine; the first without modes is phase 1.
-        beyond: the level that follows where the model cannot make the shape.
-        residual: the modes that it adds.
-        beyond_share: it follows when what the model leaves is this share of the residuals' variance, and
-        beyond_mm: this large (RMS), mm.
+        levels: levels from coarse to fine; the first without modes is phase 1.
+        beyond: level that follows if the scan shows a shape outside the model.
+        residual: settings of the residual modes of that level.
+        beyond_share: smallest share of the residuals' variance outside the model for which that level follows.
+        beyond_mm: smallest RMS of the residuals outside the model for which that level follows, mm.
         weight: a name of `WEIGHTS`.
-        narrow: scale of the weights in units of the residuals' spread, where many residuals lie far out;
-        wide: the same where they are as few as in pure noise, of which narrow weights waste a part.
-        least_spread_mm: the spread is not taken for less than this, mm.
-        normal_cosine: matches whose normals disagree more than this are left out.
-        reach: matches farther than this many widths and
-        reach_mm: this, mm, count little.
-        vertex_share: weight of a vertex's match beside that of a scan point's, for scans at least as fine as the
-            model; less for coarser ones, whose flat triangles cut the corners.
-        prior: weight of the prior beside one match,
-        beyond_prior: the same beside modes that the model lacks.
-        scale_stddev: of log s about the start.
-        seed: of the subsamples.
+        narrow: scale of the weights in units of the residuals' spread if many residuals are outliers.
+        wide: scale of the weights in units of the residuals' spread if residuals are pure noise, of which narrow
+            weights waste a part.
+        least_spread_mm: lower bound of the spread, mm.
+        normal_cosine: cosine of the angle between normals beyond which matches are excluded.
+        reach: number of widths that `reach_mm` is added to; matches farther than the sum count little.
+        reach_mm: distance that is added to `reach` widths, mm.
+        vertex_share: weight of a vertex's match relative to that of a scan point's, for scans at least as fine as the
+            model; less for coarser scans, whose flat triangles cut the corners.
+        prior: weight of the prior relative to one match.
+        beyond_prior: weight of the prior of the residual modes relative to one match.
+        scale_stddev: standard deviation of log s about the start.
+        seed: seed of the subsamples.
     """
 
     levels: tuple[Level, ...] = (
@@ -107,25 +111,26 @@ class DenseSettings:
     """Settings of the dense stage; lengths are mm of the model's frame.
 
     Args:
-        range_share: over what share of the model's size (RMS distance from its centre) the field is smooth.
-        amplitude: its standard deviation in units of what the fit left unexplained.
-        least_unexplained_mm: where less is left (RMS), there is only the field of details.
-        rounds: of matching and solving.
-        fine_range_share: over what share of the size the field of details is smooth.
-        fine_amplitude_mm: its standard deviation: finer noise is followed, coarser noise is not.
-        fine_rounds: of matching and solving for the details.
-        scan_points: how many points of the scan are matched at most.
-        vertex_share: weight of a vertex's match beside that of a scan point's.
+        range_share: range over which the field is smooth, as a share of the model's size (RMS distance from its
+            centre).
+        amplitude: standard deviation of the field in units of the unexplained residual of the fit.
+        least_unexplained_mm: unexplained residual (RMS) below which only the field of details is used.
+        rounds: number of rounds of matching and solving.
+        fine_range_share: range over which the field of details is smooth, as a share of the size.
+        fine_amplitude_mm: standard deviation of the field of details; it follows finer noise and not coarser noise.
+        fine_rounds: number of rounds of matching and solving for the details.
+        scan_points: maximum number of points of the scan that are matched.
+        vertex_share: weight of a vertex's match relative to that of a scan point's.
         weight: a name of `WEIGHTS`.
         width: scale of the weights in units of the residuals' spread.
-        normal_cosine: matches whose normals disagree more than this are left out.
-        reach: matches farther than this many widths and
-        reach_mm: this count little.
-        least_noise_mm: the scan's noise is not taken for less than this.
-        turn_cosine: no triangle turns further than this.
-        tolerance: of the solver, as a share of the pull.
-        iterations: of the solver, at most.
-        seed: of the subsamples.
+        normal_cosine: cosine of the angle between normals beyond which matches are excluded.
+        reach: number of widths that `reach_mm` is added to; matches farther than the sum count little.
+        reach_mm: distance that is added to `reach` widths.
+        least_noise_mm: lower bound of the scan's noise.
+        turn_cosine: cosine of the largest angle by which a triangle may turn.
+        tolerance: tolerance of the solver, as a share of the pull.
+        iterations: maximum number of iterations of the solver.
+        seed: seed of the subsamples.
     """
 
     range_share: float = 1.0

@@ -69,15 +69,15 @@ def compare_with_mirror_image(
 ) -> MirrorTest | None:
     """Return whether the mirror image fits better, and than those of training shapes do; None if undecidable.
 
-    If neither the scan nor its mirror image is explained by the model, which of them fits better is chance. Therefore
-    the bound is computed only if the mirror image fits better, with a failure score up to zero: training shapes are
-    fitted by the model of the others, where the scan shows them.
+    If the model explains neither the scan nor its mirror image, the better fit of the two is chance. Therefore
+    the bound is computed only if the mirror image fits better, with a failure score up to zero: training shapes, at the
+    vertices that the scan shows, are fitted by the model of the other shapes.
 
     Args:
-        model: the shape space; if its mean is too symmetric, nothing can be decided.
+        model: the shape model; if its mean is too symmetric, the chirality is undecidable.
         target: the scan in its mm frame.
-        fitted: result of the fit to it.
-        settings: of the robust method.
+        fitted: result of the fit to the scan.
+        settings: settings of the robust method.
         with_scale: whether the pose has a free scale.
     """
     if not is_asymmetric(model):

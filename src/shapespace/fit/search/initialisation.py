@@ -1,7 +1,8 @@
 """Initialisation of a fit: the unit of the scan, and a pose from landmarks or by global search.
 
-A start with centroids together holds to about 45 degrees. Beyond that, and where it does not fit clearly, many
-rotations are tried (`start_from_any_pose`), and what they reach with the leading modes free is compared both ways.
+A start with aligned centroids converges for rotations up to about 45 degrees. Beyond, or if the fit is
+not clear, many rotations are tried (`start_from_any_pose`), and their results with free leading modes are compared in
+both directions.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from shapespace.types import MM_PER_UNIT, FloatArray, Mesh, Similarity
 _SAME_TURN_TRACE = 1 + 2 * np.cos(np.radians(25.0))
 _TYPICAL_COVER = 1.2  # scan size over model size of a typical crop
 _INCH_IS_RARE = 0.5  # penalty in log size
-_PLAUSIBLE_COVER = (0.2, 2.6)  # scan size over model size that a unit may leave; 0.3 of a femur cut in half
+_PLAUSIBLE_COVER = (0.2, 2.6)  # scan size over model size for a plausible unit; 0.3 of a femur cut in half
 _LIKELIER_BY_FAR = 0.5  # difference in log size from which the second unit is ruled out
 _ONE_BASIN_DEG = 30.0  # rotation from which a refinement finds the pose of simulated scans
 _STANDS_OUT = 0.8  # score relative to that of the runner-up below which a start is unambiguous
@@ -33,14 +34,15 @@ class Start:
     """A pose that initialises a fit.
 
     Args:
-        T_scan_model: from the model's frame to the scan's frame in mm.
-        how: `landmarks`, `upright` (no rotation), `rotations` (another of the rotations tried was better), `given`.
-        score_mm: two-way capped distance of the adapted model there, mm of the model; not-a-number for landmarks and
-            `given`.
-        b: (K',) coefficients of the leading modes found there, mm; (0,) where none were.
-        runner_up_score_mm: `score_mm` of the best pose that is another one; infinite where none was tried.
-        alternatives: up to three such other poses, best first, without alternatives of their own.
-        marks: landmarks of the scan that the fit is held to; None without any.
+        T_scan_model: similarity from the model's frame to the scan's frame in mm.
+        how: source of the pose: `landmarks`, `upright` (no rotation), `rotations` (another of the tried rotations was
+            better), or `given`.
+        score_mm: two-way capped distance of the adapted model in this pose, mm of the model; not-a-number for landmarks
+            and `given`.
+        b: (K',) coefficients of the leading modes in this pose, mm; (0,) if unknown.
+        runner_up_score_mm: `score_mm` of the best distinct pose; infinite if no other pose was tried.
+        alternatives: up to three such distinct poses, best first, without alternatives of their own.
+        marks: landmarks of the scan that constrain the fit; None without any.
     """
 
     T_scan_model: Similarity
@@ -60,8 +62,8 @@ class Start:
 def find_unit(model: ShapeModel, scan: Mesh) -> str:
     """Return the unit, a name of `MM_PER_UNIT`, for which the sizes of scan and model agree best.
 
-    Where two units are about as likely by size, as centimetres and inches are for a part of a face, the likelier one in
-    which a pose of the model stands out wins, else the one in which the model fits better.
+    If two units are about equally likely by size, as centimetres and inches are for a part of a face, the likelier unit
+    with an unambiguous pose of the model wins, else the unit in which the model fits better.
 
     Raises:
         FitError: no unit brings the sizes within a factor of five.
@@ -76,7 +78,7 @@ def find_unit(model: ShapeModel, scan: Mesh) -> str:
     if not 0.2 < ratio * MM_PER_UNIT[best] < 5.0:
         raise FitError(
             f"{scan.name}: in no unit (um, mm, cm, inch, m) is it of the model's size; give its unit (--unit), or crop "
-            "it to what the model shows (--crop)."
+            "it to the part that the model contains (--crop)."
         )
     low, high = _PLAUSIBLE_COVER
     if not low < ratio * MM_PER_UNIT[second] < high or penalty[second] > penalty[best] + _LIKELIER_BY_FAR:
@@ -85,7 +87,7 @@ def find_unit(model: ShapeModel, scan: Mesh) -> str:
     scores: dict[str, float] = {}
     for unit in (best, second):
         start = start_from_any_pose(model, MM_PER_UNIT[unit] * centred, seed=0)
-        # In a wrong unit no pose stands out from the others.
+        # In a wrong unit no pose is clearly better than the others.
         if start.score_mm <= _STANDS_OUT * start.runner_up_score_mm:
             return unit
         scores[unit] = start.score_mm
@@ -102,7 +104,7 @@ def start_from_landmarks(
     """
     if not model.landmarks:
         raise FitError(
-            f"The model has no landmarks, so those given for {scan_name} cannot be used; leave them out, or build it "
+            f"The model has no landmarks, so those given for {scan_name} cannot be used; omit them, or build it "
             "with --landmarks."
         )
     names = [name for name in model.landmarks if name in scan_landmarks_mm]
@@ -128,14 +130,14 @@ def start_from_any_pose(
 ) -> Start:
     """Return the best pose of a search over all rotations, with the leading modes adapted, and the alternatives.
 
-    A scan that clearly fits without a rotation is not searched further. Another rotation wins only when it is clearly
-    better, since scans mostly come upright and some objects look the same from several sides.
+    A scan that clearly fits without a rotation is not searched further. Another rotation wins only if it is clearly
+    better, since most scans are upright and some objects look the same from several sides.
 
     Args:
-        model: what is placed.
-        scan_vertices_mm: (S, 3), at least one.
-        seed: of the subsample that is searched.
-        with_scale: whether the pose has a free scale; None goes by the model's gauge.
+        model: the shape model to place.
+        scan_vertices_mm: (S, 3) vertices of the scan, at least one, mm.
+        seed: seed of the subsample that is searched.
+        with_scale: whether the pose has a free scale; None frees it if the model's gauge is shape.
         quick: whether ambiguous poses are refined once only, which is enough for a score.
     """
     from shapespace.fit.search.pose_search import search  # numba takes a while to import
@@ -155,11 +157,12 @@ def start_from_any_pose(
 def start_of_any_size(model: ShapeModel, scan_vertices_mm: FloatArray, *, seed: int) -> Start:
     """Return the best pose with a free scale, for a scan that can be many times larger or smaller than the model.
 
-    Other sizes are tried only if no pose stands out at the scan's own size, and win only if they fit clearly better.
+    Other sizes are tried only if no pose is unambiguous at the scan's own size. They win only if they fit clearly
+    better.
 
     Args:
-        model: the shape space.
-        scan_vertices_mm: (S, 3), at least one.
+        model: the shape model.
+        scan_vertices_mm: (S, 3) vertices of the scan, at least one, mm.
         seed: seed of the subsample that is searched.
     """
     start = start_from_any_pose(model, scan_vertices_mm, seed=seed, with_scale=True)
@@ -178,11 +181,11 @@ def start_near_frame(model: ShapeModel, scan_vertices_mm: FloatArray, *, largest
     """Return the best pose with free scale whose rotation from the scan's frame is at most `largest_deg`.
 
     Args:
-        model: what is placed.
-        scan_vertices_mm: (S, 3), at least one.
-        largest_deg: rotation, degrees; beyond 30, poses rotated by two thirds of it begin too. If no refined pose is
-            within it, the pose has the rotation of the frame.
-        seed: of the subsample that is searched.
+        model: the shape model to place.
+        scan_vertices_mm: (S, 3) vertices of the scan, at least one, mm.
+        largest_deg: largest rotation, degrees; beyond 30, the search also starts from poses rotated by two thirds of
+            it. If no refined pose is within it, the pose has the rotation of the frame.
+        seed: seed of the subsample that is searched.
     """
     from shapespace.fit.search.pose_search import refine  # numba takes a while to import
 

@@ -1,4 +1,4 @@
-"""Fits of training shapes, each by the model of the others: how a right scan of another shape looks to a model."""
+"""Fits of training shapes, each by the model of the other shapes: the reference for a correct scan of a new shape."""
 
 from __future__ import annotations
 
@@ -18,17 +18,18 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh, Similarity
 
 _MOST = 10  # training shapes, a fixed random subset of larger sets, to bound the time: 2 to 10 s
-_ROUNDING = 1e-9  # share of the largest variance; modes with less are rounding
+_ROUNDING = 1e-9  # share of the largest variance; modes with less are rounding errors
 _FEWEST = 3  # training shapes; two others have one mode
 
 
 def fit_left_out(
     model: ShapeModel, fitted: RobustFitted, settings: RobustSettings, *, with_scale: bool
 ) -> Iterator[tuple[ShapeModel, ScanTarget, RobustFitted]]:
-    """Yield, for training shapes, the model of the others, the shape where the scan shows it, and the fit to it.
+    """Yield, for each training shape, the model of the others, the part of the shape that the scan shows, and its fit.
 
     Args:
-        model: shape space with its training shapes; nothing is yielded without them.
+        model: shape model with its training shapes; nothing is yielded without them.
+        fitted: result of the fit to the scan.
         fitted: result of the fit to the scan.
         settings: settings of the robust method.
         with_scale: whether the pose has a free scale.
@@ -55,7 +56,7 @@ def _model_of_others(complete: ShapeModel, coefficients: FloatArray, i: int, mod
 
     Args:
         complete: model with all modes of its training shapes.
-        coefficients: (n, K) of the training shapes, mm.
+        coefficients: (n, K) coefficients of the training shapes, mm.
         i: index of the shape that is not used.
         modes: largest number of modes.
     """

@@ -1,12 +1,13 @@
 """Global pose search: many rotations on a coarse level, the best of them with scale and leading modes.
 
-The mean shape alone cannot tell a face from the back of a bald head: what tells them apart is how close, both ways, the
-model comes once its leading modes have adapted. So poses are narrowed down in four steps, each dearer and sharper than
-the one before, and compared by that. Lengths in the settings are shares of the model's size, so any object will do.
+The mean shape alone cannot distinguish a face from the back of a bald head; the distance in both directions can, once
+the leading modes of the model have adapted. So the number of poses is reduced in four steps, each slower and more
+selective than the one before, by this distance. Lengths in the settings are shares of the model's size, so the search
+works for any object.
 
-Rigid steps are symmetric ICP from many poses at once, on grids of near points: a grid holds a near point for each cell,
-so that a match is one look-up. Weights are Geman and McClure's, with a reach that falls from step to step (graduated,
-as in Zhang, Yao and Deng, PAMI 44(7), 2022).
+Rigid steps are symmetric ICP from many poses at once, on grids of near points: a grid contains a near point for each
+cell, so that a match is one look-up. Weights are those of Geman and McClure, with a reach that decreases from step to
+step (graduated, as in Zhang, Yao and Deng, PAMI 44(7), 2022).
 """
 
 from __future__ import annotations
@@ -35,8 +36,9 @@ class NearGrid(NamedTuple):
     """Grid with a near point for each cell.
 
     Args:
-        near: (X, Y, Z) int32, for each cell, of the points that stand for a cell, that of the nearest such cell.
-        points: (3, N) mm.
+        near: (X, Y, Z) int32 index of a point for each cell: the representative of the nearest cell that contains
+            points.
+        points: (3, N) points of the grid, mm.
         origin: (3, 1) lowest corner, mm.
         cell: length of the edges of a cell, mm.
     """
@@ -52,7 +54,7 @@ class NearGrid(NamedTuple):
         low, high = points.min(axis=0) - _MARGIN * size, points.max(axis=0) + _MARGIN * size
         cell = max(_CELL * size, edge_of(high - low, _MAX_CELLS))
         inside = (points - low) / cell
-        # The point nearest to the middle of its cell stands for it, so it is written last.
+        # The point nearest to the middle of its cell represents it, so it is written last.
         order = np.argsort(-((inside % 1.0 - 0.5) ** 2).sum(axis=1))
         holder = np.full(np.ceil((high - low) / cell).astype(int) + 1, -1, dtype=np.int32)
         holder[tuple(inside[order].astype(int).T)] = order
@@ -60,7 +62,7 @@ class NearGrid(NamedTuple):
         return NearGrid(holder[tuple(nearest)], np.ascontiguousarray(points.T), low[:, None], cell)
 
     def look_up(self, places: FloatArray) -> FloatArray:
-        """Return a point near to each of `places` (S, 3, N), in the same order; outside the box that of its border."""
+        """Return a point near to each of `places` (S, 3, N), in the same order; outside the grid, near its border."""
         _, ny, nz = self.near.shape
         cells = np.clip((places - self.origin) / self.cell, 0.0, np.array(self.near.shape)[:, None] - 1.0).astype(
             np.int32
@@ -87,14 +89,14 @@ def rigid_search(
     """Return rotations, translations and scores (S,), mm, of two-way rigid ICP from each of S poses.
 
     Args:
-        R: (S, 3, 3) from the model's frame to the scan's.
-        t: (S, 3).
-        model: (M, 3) points of the model that look for the scan.
-        scan: (N, 3) points of the scan that look for the model.
+        R: (S, 3, 3) rotations from the model's frame to the scan's.
+        t: (S, 3) translations.
+        model: (M, 3) points of the model that are matched to the scan.
+        scan: (N, 3) points of the scan that are matched to the model.
         model_grid: near points of the model, in its own frame.
         scan_grid: near points of the scan.
         radii: (I,) distance at which a match loses three quarters of its weight, for each iteration, mm.
-        cap: distance beyond which a match counts no more in the score, mm.
+        cap: distance at which matches are capped in the score, mm.
     """
     for radius in radii:
         y, x, forward, backward = _matches(R, t, model, scan, model_grid, scan_grid)
@@ -135,12 +137,12 @@ class Step(NamedTuple):
     """Settings of one step of the search.
 
     Args:
-        points: how many points of each side look for the other.
-        widest: reach of the weights in the first iteration, share of the model's size,
-        narrowest: and in the last,
-        iterations: of these many; the reach falls geometrically.
-        modes: how many modes are free.
-        n_poses: how many distinct poses go on to the next step.
+        points: number of points of each side that are matched to the other.
+        widest: reach of the weights in the first iteration, as a share of the model's size.
+        narrowest: reach of the weights in the last iteration, as a share of the model's size.
+        iterations: number of iterations; the reach decreases geometrically.
+        modes: number of free modes.
+        n_poses: number of distinct poses that are passed to the next step.
     """
 
     points: int
@@ -155,7 +157,7 @@ class Step(NamedTuple):
         return np.geomspace(self.widest * size, self.narrowest * size, self.iterations)
 
 
-# Chosen on simulated scans of other people than those of the tests.
+# Chosen on simulated scans of people who are not in the tests.
 GLANCE = Step(points=250, widest=0.3, narrowest=0.04, iterations=14, modes=10, n_poses=1)
 FLIPS = Step(points=90, widest=0.3, narrowest=0.06, iterations=6, modes=3, n_poses=1)
 COARSE = Step(points=250, widest=0.5, narrowest=0.1, iterations=10, modes=0, n_poses=30)
@@ -170,8 +172,8 @@ _MAX_THINNING_CELLS = 4_000_000  # memory limit
 # largest distance that counts in the score, as shares of the model's size: rigid, and with shape
 _RIGID_CAP, _CAP = 0.1, 0.06
 _PRIOR = 10.0  # weight of the prior on the coefficients
-_SCALE_STDDEV = 0.15  # of the prior on the relative scale
-# poses within 20 degrees and this share of the model's size are the same one
+_SCALE_STDDEV = 0.15  # standard deviation of the prior on the relative scale
+# poses within 20 degrees and this share of the model's size count as the same
 _SAME_TURN, _SAME_PLACE = math.cos(math.radians(20.0)), 0.3
 _OTHER_TURN = math.cos(math.radians(40.0))  # alternatives to report differ by 40 degrees
 # scores that end the search early: as a share of the cap, and of the best flipped pose
@@ -179,7 +181,7 @@ _CLEARLY_CLOSE, _CLEARLY_BETTER = 0.45, 0.75
 _SURE = 0.85  # score relative to the runner-up below which no more iterations are run
 _CLEARLY_WORSE, _WORTH = 0.93, 0.05  # how much worse an upright pose may score: ratio to the best, or share of the cap
 _PARTIAL, _PARTS = 0.7, 6
-"""A scan with less than this share of the model's area is also placed at so many parts of the model."""
+"""Share of the model's area below which a scan is also placed at parts of the model, and the number of these parts."""
 _MORE_ROUNDS = 3  # repetitions of the last step for ambiguous poses
 
 
@@ -188,10 +190,10 @@ class Pose:
     """A pose with adapted coefficients, and its score.
 
     Args:
-        T_scan_model: from the model's frame to the scan's, mm.
-        b: (K,) of the leading modes, mm.
-        score_mm: two-way distance, mm of the model, each match counted up to a cap; infinite where nothing fits.
-        covered: share of the model's points that have the scan where they are.
+        T_scan_model: similarity from the model's frame to the scan's, mm.
+        b: (K,) coefficients of the leading modes, mm.
+        score_mm: two-way distance, mm of the model, each match capped; infinite if no pose fits.
+        covered: share of the model's points for which the scan has a point there.
     """
 
     T_scan_model: Similarity
@@ -203,16 +205,16 @@ class Pose:
 def search(
     model: ShapeModel, scan_vertices_mm: FloatArray, *, with_scale: bool, seed: int, quick: bool = False
 ) -> tuple[Pose, list[Pose]]:
-    """Return the pose that begins from no rotation, and distinct poses, best first, from everywhere.
+    """Return the pose found without a rotation, and distinct poses of the complete search, best first.
 
-    Where no rotation is clearly right, nothing more than its likeliest confusions is tried; where another one is not
+    If the pose without a rotation is clearly right, only its likeliest confusions are tested; if no other pose is
     clearly better, it comes first.
 
     Args:
-        model: the shape space.
-        scan_vertices_mm: (S, 3).
+        model: the shape model.
+        scan_vertices_mm: (S, 3) vertices of the scan, mm.
         with_scale: whether the pose has a free scale.
-        seed: of the subsample that is searched.
+        seed: seed of the subsample that is searched.
         quick: whether ambiguous poses are refined once only, which is enough for a score.
     """
     sides = _Sides.of(model, scan_vertices_mm, with_scale, seed)
@@ -236,12 +238,12 @@ def refine(
     """Return the poses after one step of the search from each of `starts`, in their order.
 
     Args:
-        model: the shape space.
-        scan_vertices_mm: (S, 3).
-        starts: from the model's frame to the scan's, mm.
+        model: the shape model.
+        scan_vertices_mm: (S, 3) vertices of the scan, mm.
+        starts: poses to start from, from the model's frame to the scan's, mm.
         with_scale: whether the pose has a free scale.
-        step: of the search.
-        seed: of the subsample that is searched.
+        step: step of the search.
+        seed: seed of the subsample that is searched.
     """
     sides = _Sides.of(model, scan_vertices_mm, with_scale, seed)
     return [sides.refined(step, T.rotation, T.translation, T.scale) for T in starts]
@@ -268,7 +270,7 @@ class _ModelSide:
     def of(model: ShapeModel) -> _ModelSide:
         mean = np.array(model.mean_vertices)
         size = rms_size(mean)
-        chosen = np.random.default_rng(0).permutation(_evenly(mean, _MODEL_CELL * size, size))
+        chosen = np.random.default_rng(0).permutation(_thin_evenly(mean, _MODEL_CELL * size, size))
         points = np.ascontiguousarray(mean[chosen])
         normals = _normals(points) if model.faces is None else vertex_normals(Mesh(mean, model.faces))[chosen]
         tree, shapes = KdTree(points).arrays, dict[int, ShapePoints]()
@@ -313,15 +315,15 @@ class _Sides:
         side = _ModelSide.of(model)
         scan_mm = np.array(scan_mm)
         cell = _SCAN_CELL * side.size
-        scan = np.array(scan_mm[np.random.default_rng(seed).permutation(_evenly(scan_mm, cell, side.size))])
-        # A surface crosses about 1.5 cells per squared edge, so the coarser count tells the area.
-        spacing = 2 * cell * math.sqrt(len(_evenly(scan, 2 * cell, side.size)) / 1.5 / len(scan))
+        scan = np.array(scan_mm[np.random.default_rng(seed).permutation(_thin_evenly(scan_mm, cell, side.size))])
+        # A surface crosses about 1.5 cells per squared edge, so the coarser count determines the area.
+        spacing = 2 * cell * math.sqrt(len(_thin_evenly(scan, 2 * cell, side.size)) / 1.5 / len(scan))
         slack = np.array([1.5 * max(spacing, 0.5 * side.spacing), 1.2 * side.spacing])
         return _Sides(side, scan, KdTree(scan), slack, with_scale)
 
     def upright(self) -> Pose:
-        """Return the better of two poses without rotation: centres together, or the outermost parts."""
-        R, t = self._placed(np.eye(3)[None])
+        """Return the better of two poses without rotation: aligned centroids, or aligned outermost parts."""
+        R, t = self._place_rotations(np.eye(3)[None])
         pose = self.refined(GLANCE, R[0], t[0])
         return pose if self.is_close(pose) else min(pose, self.refined(GLANCE, R[1], t[1]), key=_score)
 
@@ -341,7 +343,7 @@ class _Sides:
     def everywhere(self, upright: Pose, *, quick: bool) -> list[Pose]:
         """Return distinct poses, best first, of a search over all rotations; `quick` as for `search`."""
         grid, size = NearGrid.of(self.scan, self.model.size), self.model.size
-        R, t = self._placed(_even_rotations(ROTATIONS))
+        R, t = self._place_rotations(_even_rotations(ROTATIONS))
         T = upright.T_scan_model
         R, t = np.concatenate([T.rotation[None], R]), np.concatenate([T.translation[None], t])
         for step in (COARSE, RIGID):
@@ -359,54 +361,55 @@ class _Sides:
             kept_rows = order[_distinct_rows(R[order], t[order], step.n_poses, _SAME_TURN, _SAME_PLACE * size)]
             R, t = R[kept_rows], t[kept_rows]
         coarse = sorted((self.refined(MIDDLE, *start) for start in zip(R, t, strict=True)), key=_score)
-        coarse = _distinct(coarse, len(coarse), _SAME_TURN)
-        poses = [self._again(FINE, pose) for pose in coarse[: MIDDLE.n_poses]]
+        coarse = _select_distinct(coarse, len(coarse), _SAME_TURN)
+        poses = [self._refine_again(FINE, pose) for pose in coarse[: MIDDLE.n_poses]]
         poses = sorted([upright, *poses], key=_score)
-        poses = [self._again(LONG, pose) for pose in poses[: FINE.n_poses]] + poses[FINE.n_poses :]
+        poses = [self._refine_again(LONG, pose) for pose in poses[: FINE.n_poses]] + poses[FINE.n_poses :]
         distinct_poses = _best_distinct(poses)
         if quick:
             return distinct_poses
         if not _is_sure(distinct_poses):
             second_batch = coarse[MIDDLE.n_poses : 2 * MIDDLE.n_poses]
             poses = poses[: FINE.n_poses] + [
-                self._again(LONG, pose) for pose in [*poses[FINE.n_poses :], *second_batch]
+                self._refine_again(LONG, pose) for pose in [*poses[FINE.n_poses :], *second_batch]
             ]
             distinct_poses = _best_distinct(poses)
-        # A large part missing lets the model slide for long before it locks in.
+        # If a large part is missing, the model slides for many iterations before it converges.
         for _ in range(_MORE_ROUNDS):
             if _is_sure(distinct_poses):
                 break
             distinct_poses = _best_distinct(
-                [self._again(LONG, pose) for pose in distinct_poses[: FINE.n_poses]] + distinct_poses[FINE.n_poses :]
+                [self._refine_again(LONG, pose) for pose in distinct_poses[: FINE.n_poses]]
+                + distinct_poses[FINE.n_poses :]
             )
         return distinct_poses
 
     def upright_unless_clearly_worse(self, upright: Pose, ranked: list[Pose]) -> list[Pose]:
         """Return `ranked` with the pose nearest to `upright` first, unless the best is clearly better."""
         limit = max(ranked[0].score_mm / _CLEARLY_WORSE, ranked[0].score_mm + _WORTH * _CAP * self.model.size)
-        similar = [pose for pose in ranked if len(_distinct([upright, pose], 2, _SAME_TURN)) == 1]
+        similar = [pose for pose in ranked if len(_select_distinct([upright, pose], 2, _SAME_TURN)) == 1]
         first = min([upright, *similar], key=_score)
         if first.score_mm > limit:
             return ranked
-        return _distinct([first, *ranked], LONG.n_poses, _OTHER_TURN)
+        return _select_distinct([first, *ranked], LONG.n_poses, _OTHER_TURN)
 
-    def _placed(self, rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return poses for each of `rotations` (N, 3, 3): centres together, and the model's front at the scan's.
+    def _place_rotations(self, rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return poses for each of `rotations` (N, 3, 3): with aligned centroids, and with aligned fronts.
 
-        The centre of a scan that shows a part of the model is also placed at those of parts all over the model.
+        The centroid of a scan that shows a part of the model is also placed at those of parts all over the model.
         """
         centre, towards, points = self.scan.mean(axis=0), rotations @ self.model.outward, self.model.points
         translation = centre - rotations @ points.mean(axis=0)
         front_offset = np.quantile((self.scan[:1000] - centre) @ towards.T, 0.95, axis=0) - self.model.front
         translations = [translation, translation + front_offset[:, None] * towards]
-        # Points fill nearly all cells of four spacings, also of a sparse scan: their number tells the area.
+        # Points fill nearly all cells of four spacings, even for a sparse scan: their number determines the area.
         cell, size = 4 / 1.5 * float(self.slack[0]), self.model.size
-        share = len(_evenly(self.scan, cell, size)) / len(_evenly(points, cell, size))
+        share = len(_thin_evenly(self.scan, cell, size)) / len(_thin_evenly(points, cell, size))
         if share < _PARTIAL:
             translations += [centre - rotations @ part for part in _parts(points, round(share * len(points)))]
         return np.concatenate([rotations] * len(translations)), np.concatenate(translations)
 
-    def _again(self, step: Step, pose: Pose) -> Pose:
+    def _refine_again(self, step: Step, pose: Pose) -> Pose:
         T = pose.T_scan_model
         return self.refined(step, T.rotation, T.translation, T.scale, pose.b)
 
@@ -431,7 +434,7 @@ class _Sides:
 
 
 def _parts(points: FloatArray, count: int) -> FloatArray:
-    """Return (P, 3) centres of parts of `count` points each, about points that lie far from each other."""
+    """Return (P, 3) centroids of parts of `count` points each, about points that lie far from each other."""
     seeds = [int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmax())]
     while len(seeds) < _PARTS:
         seeds.append(int(np.linalg.norm(points[:, None] - points[seeds], axis=2).min(axis=1).argmax()))
@@ -440,14 +443,14 @@ def _parts(points: FloatArray, count: int) -> FloatArray:
 
 
 def _best_distinct(poses: Sequence[Pose]) -> list[Pose]:
-    return _distinct(sorted(poses, key=_score), LONG.n_poses, _OTHER_TURN)
+    return _select_distinct(sorted(poses, key=_score), LONG.n_poses, _OTHER_TURN)
 
 
 def _is_sure(poses: Sequence[Pose]) -> bool:
     return len(poses) < 2 or poses[0].score_mm <= _SURE * poses[1].score_mm
 
 
-def _distinct(poses: Sequence[Pose], limit: int, same_turn: float) -> list[Pose]:
+def _select_distinct(poses: Sequence[Pose], limit: int, same_turn: float) -> list[Pose]:
     """Return up to `limit` of `poses`, without rotations close to an earlier one."""
     R = np.stack([pose.T_scan_model.rotation for pose in poses])
     return [poses[i] for i in _distinct_rows(R, np.zeros((len(R), 3)), limit, same_turn, math.inf)]
@@ -465,7 +468,7 @@ def _distinct_rows(R: FloatArray, t: FloatArray, limit: int, same_turn: float, s
     return distinct
 
 
-def _evenly(points: FloatArray, cell: float, size: float) -> IntArray:
+def _thin_evenly(points: FloatArray, cell: float, size: float) -> IntArray:
     """Return the indices of one point for each cell of edge `cell`; isolated points far outside are excluded."""
     columns = np.ascontiguousarray(points.T)
     low, high = np.quantile(columns[:, :: max(1, len(points) // 4000)], [0.005, 0.995], axis=1)

@@ -41,7 +41,7 @@ _TIGHT, _LEAST_SIDE = 0.5, 2  # two layers: largest width of one relative to the
 
 # displaced points, fewer cannot show whether a similarity explains them; iterations, a shift along the surface is slow
 _FEWEST_MOVED, _MOVES = 30, 100
-_LARGEST_SCALE = 2.0  # scale of a part about another; a part that the surface does not explain shrinks to a point of it
+_LARGEST_SCALE = 2.0  # scale of a part moved onto the surface, or its inverse; another shape would shrink to a point
 
 # Chosen on the development seeds of `benchmarks/odd_cases.py`, and on 42 heads with hair.
 _ALL_EXPLAINED = 0.97
@@ -56,7 +56,7 @@ class SecondInstance:
 
     Args:
         away_mm: distance of its centroid from that of the first, mm of the scan.
-        gap_mm: gap between the two along the line through their centroids, mm of the scan; negative where they
+        gap_mm: gap between the two along the line through their centroids, mm of the scan; negative if they
             overlap.
 
     Example:
@@ -71,8 +71,8 @@ class SecondInstance:
     def note(self) -> str:
         """Sentence for the notes of a fit."""
         return (
-            f"The scan shows a second instance that the model fits as well, {self.away_mm:.0f} mm away; crop it to the "
-            "one you mean (--crop)."
+            f"The scan shows a second instance that the model fits as well, {self.away_mm:.0f} mm away; crop it to one "
+            "of them (--crop)."
         )
 
 
@@ -84,10 +84,10 @@ def find_second_instance(
     The model is fitted to the unexplained part of the scan, and the status of that fit is estimated as usual.
 
     Args:
-        model: the shape space.
+        model: the shape model.
         target: the scan in its mm frame.
-        fitted: result of the fit to it.
-        settings: of the robust method.
+        fitted: result of the fit to the scan.
+        settings: settings of the robust method.
         with_scale: whether the pose has a free scale.
     """
     if fitted.match_evidence.scan_near_share > _EXPLAINED:
@@ -149,15 +149,15 @@ class Layers:
 def find_displaced(model: ShapeModel, target: ScanTarget, fitted: RobustFitted) -> Displaced:
     """Return the shares of the scan that run along the fitted surface at a distance, and that scatter.
 
-    Where the parts of a scan differ in scale or pose, the fit follows one part, and the others run along the surface at
-    a distance. Around a point of them the heights over the fitted surface are alike, and little else of the scan is
-    unexplained. Outliers, noise and loose hair scatter: heights around a point differ. All are zero where the fit
+    If the parts of a scan differ in scale or pose, the fit follows one part, and the others run along the surface at
+    a distance. Around a displaced point the heights over the fitted surface are alike, and little else of the scan is
+    unexplained. Outliers, noise and loose hair scatter: heights around a point differ. All shares are zero if the fit
     explains nearly all of the scan.
 
     Args:
-        model: the shape space.
+        model: the shape model.
         target: the scan in its mm frame.
-        fitted: result of the fit to it.
+        fitted: result of the fit to the scan.
     """
     return _displaced_points(model, target, fitted)[0]
 
@@ -165,17 +165,17 @@ def find_displaced(model: ShapeModel, target: ScanTarget, fitted: RobustFitted) 
 def compare_displaced(
     model: ShapeModel, target: ScanTarget, fitted: RobustFitted, settings: RobustSettings, *, with_scale: bool
 ) -> DisplacedTest:
-    """Move the displaced part onto the fitted surface, and compare its share with those of left-out training shapes.
+    """Move the displaced part onto the fitted surface, and compare its share with those of held-out training shapes.
 
-    Where a part was assembled wrongly, the model explains the rest, and a similarity moves the part onto the surface.
-    Training shapes are fitted by the model of the others, where the scan shows them: a model of few shapes leaves parts
-    of a new shape at a distance too.
+    If a part was assembled wrongly, the model explains the rest, and a similarity moves the part onto the surface.
+    Training shapes, at the vertices that the scan shows, are fitted by the model of the other shapes: a model of few
+    shapes leaves parts of a new shape at a distance too.
 
     Args:
-        model: the shape space.
+        model: the shape model.
         target: the scan in its mm frame.
-        fitted: result of the fit to it.
-        settings: of the robust method.
+        fitted: result of the fit to the scan.
+        settings: settings of the robust method.
         with_scale: whether the pose has a free scale.
     """
     points = _displaced_points(model, target, fitted)[1]
@@ -227,13 +227,13 @@ def find_layers(model: ShapeModel, target: ScanTarget, fitted: RobustFitted) -> 
     """Return the share of the scan with two surfaces on top of each other, and their distance.
 
     Around a point of such a scan the heights over the fitted surface fall into two tight groups with a gap between.
-    Noise leaves no gap, and what is thrown off the surface forms no tight group. Both are zero where matched points lie
-    so close that it is not looked for.
+    Noise leaves no gap, and points scattered off the surface form no tight group. Both are zero if matched points are
+    so close to the surface that the search is skipped.
 
     Args:
-        model: the shape space.
+        model: the shape model.
         target: the scan in its mm frame.
-        fitted: where the fit to it ended.
+        fitted: result of the fit to the scan.
     """
     size_mm = fitted.match_evidence.size_mm
     if fitted.match_evidence.spread_mm < _APART * size_mm:
@@ -262,7 +262,7 @@ def find_layers(model: ShapeModel, target: ScanTarget, fitted: RobustFitted) -> 
 def _fit_pose_again(fitted: RobustFitted, remaining_points: FloatArray, size_mm: float) -> Similarity | None:
     """Return the pose, of similar rotation, at which the fitted shape lies on `remaining_points` (R, 3), or None.
 
-    It is far cheaper than a search, which a head or a collar around a face would otherwise cost.
+    It is far faster than a search, which a head or a collar around a face would otherwise require.
     """
     T, tree, rng = fitted.T_scan_fitted, cKDTree(remaining_points), np.random.default_rng(0)
     x = fitted.vertices_scan_mm[rng.choice(len(fitted.vertices_scan_mm), _GLANCED)]

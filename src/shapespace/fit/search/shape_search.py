@@ -20,11 +20,11 @@ class ShapePoints(NamedTuple):
     """Points, normals and modes of the model for the shape search, in the model's frame.
 
     Args:
-        points: (M, 3) of the mean, mm.
-        normals: (M, 3) unit normals of either side; zero where there is none.
+        points: (M, 3) points of the mean, mm.
+        normals: (M, 3) unit normals, of either sign; zero if unknown.
         modes: (M, 3, K) rows of the basis.
         precision: (K,) 1 / stddev^2, mm^-2.
-        tree: of `points`.
+        tree: search tree of `points`.
     """
 
     points: FloatArray
@@ -97,26 +97,26 @@ def shape_search(
 ) -> float:
     """Run symmetric Gauss-Newton over pose and leading modes from one pose, in place, and return the final scale.
 
-    All is solved in the model's frame, where the modes need no turning; a mean point x and a scan point q brought
-    there differ by e = x - q, and the cost is sum w e^T (n n^T + eta I) e + prior_weight radius^2 (sum b_k^2 / lam_k
-    + c log(scale)^2), w Geman and McClure's.
+    The equations are solved in the model's frame, where the modes need no rotation; a mean point x and a scan point q
+    in that frame differ by e = x - q, and the cost is sum w e^T (n n^T + eta I) e + prior_weight radius^2 (sum b_k^2 /
+    lam_k + c log(scale)^2), with w of Geman and McClure.
 
     Args:
         R: (3, 3) rotation from the model's frame to the scan's, replaced.
         t: (3,) translation, replaced.
-        scale: where it begins.
+        scale: initial scale.
         b: (K,) coefficients, replaced, mm.
         shape: the model.
         scan: (N, 3) points of the scan, in any order.
-        tree: of the scan's points.
-        counts: (2,) how many of the first points of the model and of the scan look for the other.
-        radii: (I,) of the weights, for each iteration, mm.
+        tree: search tree of the scan's points.
+        counts: (2,) number of the first points of the model, and of the scan, that are matched to the other.
+        radii: (I,) reach of the weights for each iteration, mm.
         prior_weight: weight of the prior.
-        scale_precision: c; infinity holds the scale.
-        slack: (2,) how far a match may lie sideways, model to scan and back, mm.
-        cap: distance beyond which a match counts no more in the score, mm.
+        scale_precision: c; infinity fixes the scale.
+        slack: (2,) largest sideways distance of a match, model to scan and back, mm.
+        cap: distance at which matches are capped in the score, mm.
         out: (3,) replaced by: score of the model to the scan, of the scan to the model, mm, and the share of the
-            model's points that have the scan where they are; infinite where a step has no solution.
+            model's points for which the scan has a point there; infinite if a step has no solution.
     """
     n_modes = len(b)
     size = 7 + n_modes
@@ -229,7 +229,7 @@ def shape_search(
             out[:] = np.inf
             break
         angle = np.sqrt(g[0] ** 2 + g[1] ** 2 + g[2] ** 2)
-        # A step of Gauss-Newton is only good nearby.
+        # A step of Gauss-Newton is only good for small motions.
         shrink = min(1.0, 0.35 / max(angle, 1e-12))
         for k in range(3):
             y[k] = -shrink * g[k]
