@@ -98,7 +98,7 @@ def test_memory_is_limited_as_asked(run: Run, tmp_path: Path) -> None:
         (np.zeros(SHAPE, dtype=np.uint8), "all its voxels are 0"),
         (labels() + 2 * np.roll(labels(2.5), 6, axis=2), "it has the labels 1, 2; say which (--label)"),
         (np.pad([[[1]]], 3).astype(np.uint8), "only 1 voxel"),
-        (labels() * np.float32(0.3), "not whole numbers"),
+        (labels() * np.float32(0.3), "not integers"),
         (np.stack([labels()] * 2, axis=-1), "more than one volume"),
     ],
 )  # fmt: skip

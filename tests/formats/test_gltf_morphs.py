@@ -210,7 +210,7 @@ def test_many_targets_on_one_array_are_refused_before_they_are_made(tmp_path: Pa
     }
     path = tmp_path / "bomb.gltf"
     path.write_text(json.dumps(tree))
-    with pytest.raises(ShapespaceError, match="unfold to more than"):
+    with pytest.raises(ShapespaceError, match="expand to more than"):
         read_gltf_model(path)
 
 

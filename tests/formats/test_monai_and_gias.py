@@ -129,7 +129,7 @@ def test_a_surface_of_another_mean_is_refused(model: ShapeModel, tmp_path: Path)
 def test_pickles_and_bombs_are_refused(model: ShapeModel, tmp_path: Path) -> None:
     path = gias(tmp_path / "a.pc.npz", model, modes=np.array([{}], dtype=object))
     assert is_known(path)
-    with pytest.raises(ShapespaceError, match="holds objects"):
+    with pytest.raises(ShapespaceError, match="contains objects"):
         read_gias(path)
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:

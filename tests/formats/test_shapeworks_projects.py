@@ -256,7 +256,7 @@ def test_a_project_that_names_one_file_many_times_is_refused_before_it_fills_the
     monkeypatch.setattr("shapespace.io.read_limits.SPARE_BYTES", 2**20)
     np.savetxt(tmp_path / "big.particles", np.zeros((10_000, 3)), "%d")
     rows = [{"world_particles_1": "big.particles"}] * 4_000
-    with pytest.raises(ShapespaceError, match="unfold to more than"):
+    with pytest.raises(ShapespaceError, match="expand to more than"):
         read_shapeworks(swproj(tmp_path, rows))
 
 
