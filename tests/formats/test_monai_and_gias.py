@@ -69,7 +69,7 @@ def test_monai_physio_is_read_with_its_surface_and_total_variance(
 
 @pytest.mark.parametrize(
     ("change", "said"),
-    [("no surface", "needs the surface"), ("other surface", "do not belong"), ("text", "of numbers"), ("cut", "JSON")],
+    [("no surface", "needs the surface"), ("other surface", "do not match"), ("text", "of numbers"), ("cut", "JSON")],
 )
 def test_damaged_monai_physio_is_refused_in_one_sentence(
     change: str, said: str, model: ShapeModel, tmp_path: Path
@@ -145,7 +145,7 @@ def test_pickles_and_bombs_are_refused(model: ShapeModel, tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("name", READ_ONLY_MODELS)
 def test_formats_that_are_only_read_say_so(name: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="only read; choose one of eos"):
+    with pytest.raises(InputError, match="can only be read; choose one of eos"):
         format_to_write(tmp_path / "a.h5", name)
 
 

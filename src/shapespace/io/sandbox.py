@@ -98,7 +98,7 @@ def _read(path: Path, request: dict[str, Any]) -> Tree:
             "most_memory": PROGRAM_BYTES + 3 * most_bytes,
             "most_seconds": seconds,
         }
-        # A separate program instead of multiprocessing: a fork of a process with threads may hang, and spawn would run a
+        # A separate program, not multiprocessing: a fork of a process with threads may hang, and spawn would run a
         # script without a main guard again. -P excludes the folder of the program from the module search path.
         command = [sys.executable, "-P", str(Path(sandbox_child.__file__)), json.dumps(request)]
         environment = os.environ | {
