@@ -11,13 +11,13 @@ import numpy.typing as npt
 
 _SMALL = 9  # elements; a rotation matrix is printed in full
 _MOST_NAMES = 4  # entries in one line
-_LONGEST = 80  # characters; a terminal's line
+_LONGEST = 80  # characters of a line in a terminal
 
 
 def short_repr(self: Any) -> str:
     """Return the fields of a dataclass in one line: arrays by shape and type, long sequences by length.
 
-    It stands in a class as `__repr__ = short_repr`.
+    A class uses it as `__repr__ = short_repr`.
     """
     shown_fields = (f"{item.name}={describe_briefly(getattr(self, item.name))}" for item in fields(self) if item.repr)
     return f"{type(self).__name__}({', '.join(shown_fields)})"
@@ -69,7 +69,7 @@ def _clip(text: str) -> str:
 
 
 def describe_groups(groups: Sequence[Sequence[str]]) -> str:
-    """Return a sentence on the groups of scans of a correspondence; empty if all are of one kind."""
+    """Return a sentence on the groups of scans of a correspondence; empty if all belong to one group."""
     if not groups:
         return ""
     others = (f"{len(group)} are alike and differ from them" for group in groups[1:])

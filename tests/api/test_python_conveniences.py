@@ -147,7 +147,7 @@ SHAPES = np.stack([V + k * np.sin(V) for k in range(4)])
 WRONG_ARRAYS: dict[str, tuple[Callable[[], object], str]] = {
     "vertices": (lambda: ss.Mesh(V[:, :2]), r"\(V, 3\), not \(20, 2\)"),
     "faces": (lambda: ss.Mesh(V, F + 30), "points at vertex 34.*correct the faces"),
-    "fractions": (lambda: ss.Mesh(V, F + 0.5), "whole numbers"),
+    "fractions": (lambda: ss.Mesh(V, F + 0.5), "integers"),
     "model": (lambda: ss.ShapeModel(V, np.eye(60)[:, :1], np.ones(1), 1.0, 2, faces=F + 30), "correct the faces"),
     "projected": (lambda: ss.build_model(SHAPES).project(V[:, :2]), r"\(V, 3\), not \(20, 2\)"),
     "fitted": (lambda: ss.fit_scan(ss.build_model(SHAPES), V + np.nan), "no points with finite coordinates; correct"),
