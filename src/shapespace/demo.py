@@ -169,7 +169,7 @@ def _experiment_1(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _
         pose = random_similarity(rng, max_angle_deg=20.0, scale_range=(0.9, 1.1), translation_mm=100.0)
         scans[name] = simulate_scan(truth, rng, triangles=scale.triangles, noise_mm=0.2, T_scan_model=pose, name=name)
         labels[name] = (expression, level)
-    fits = _fit_all(home, model, scans, labels, _paper(scale), clock)
+    fits = _fit_all(home, model, scans, labels, _paper_config(scale), clock)
 
     make_folder(home / "training")
     examples: list[Example] = []
@@ -304,7 +304,7 @@ def _case(home: Path, story: _Story, scale: DemoScale, clock: _Clock) -> Case:
         model.save(home / file)
     mesh = story.scan.scan if isinstance(story.scan, SimulatedScan) else story.scan
     name = f"{Path(mesh.name).stem}_{story.model_name}"
-    paper = _paper(scale)
+    paper = _paper_config(scale)
     fit, robust = (
         _fit_all(
             home=home,
@@ -333,7 +333,7 @@ def _case(home: Path, story: _Story, scale: DemoScale, clock: _Clock) -> Case:
     )
 
 
-def _paper(scale: DemoScale) -> FitConfig:
+def _paper_config(scale: DemoScale) -> FitConfig:
     """Return the settings of the paper's method."""
     return FitConfig(Paper(stop_motion_mm=scale.stop_motion_mm))
 

@@ -37,28 +37,28 @@ def list_briefly(parts: Sequence[str]) -> str:
 def describe_briefly(value: Any) -> str:
     """Return a short text for `value`, without computing or reading anything."""
     if isinstance(value, np.ndarray):
-        return _of_array(cast(npt.NDArray[Any], value))
+        return _describe_array(cast(npt.NDArray[Any], value))
     if isinstance(value, Mapping):
-        return _of_mapping(cast(Mapping[object, object], value))
+        return _describe_mapping(cast(Mapping[object, object], value))
     if isinstance(value, list | tuple):
         items = cast(Sequence[object], value)
         if len(items) > _MOST_NAMES or any(not isinstance(item, str | int | float) for item in items):
             return f"<{len(items)} items>"
-    return f"{value:.6g}" if isinstance(value, float) else _of_other(cast(object, value))
+    return f"{value:.6g}" if isinstance(value, float) else _describe_other(cast(object, value))
 
 
-def _of_mapping(value: Mapping[object, object]) -> str:
+def _describe_mapping(value: Mapping[object, object]) -> str:
     names = [str(name) for name in value]
     others_note = f", and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
     return "{" + ", ".join(_clip(name) for name in names[:_MOST_NAMES]) + others_note + "}"
 
 
-def _of_other(value: object) -> str:
+def _describe_other(value: object) -> str:
     text = repr(value)
     return f"{type(value).__name__}(…)" if is_dataclass(value) and len(text) > _LONGEST else _clip(text)
 
 
-def _of_array(array: npt.NDArray[Any]) -> str:
+def _describe_array(array: npt.NDArray[Any]) -> str:
     if array.size <= _SMALL and array.dtype.kind in "iufb":
         return " ".join(np.array2string(array, precision=4, separator=", ").split())
     return f"<{' x '.join(map(str, array.shape))} {array.dtype}>"

@@ -450,13 +450,13 @@ class SurfaceReview(Struct, frozen=True, kw_only=True):
         """Count surfaces by the `codes` of their reasons, which are empty for a surface that needs no review."""
         every = [set(own) for own in codes]
         counts: Counter[ReviewCode] = Counter(code for own in every for code in own)
-        return SurfaceReview(surfaces=len(every), needs_review=sum(map(bool, every)), reasons=_in_order(counts))
+        return SurfaceReview(surfaces=len(every), needs_review=sum(map(bool, every)), reasons=_sort_counts(counts))
 
     def __add__(self, other: SurfaceReview) -> SurfaceReview:
         return SurfaceReview(
             surfaces=self.surfaces + other.surfaces,
             needs_review=self.needs_review + other.needs_review,
-            reasons=_in_order(Counter(self.reasons) + Counter(other.reasons)),
+            reasons=_sort_counts(Counter(self.reasons) + Counter(other.reasons)),
         )
 
     @property
@@ -465,7 +465,7 @@ class SurfaceReview(Struct, frozen=True, kw_only=True):
         return 2 * self.needs_review > self.surfaces
 
 
-def _in_order(counts: Mapping[ReviewCode, int]) -> dict[ReviewCode, int]:
+def _sort_counts(counts: Mapping[ReviewCode, int]) -> dict[ReviewCode, int]:
     return {code: counts[code] for code in get_args(ReviewCode) if code in counts}
 
 

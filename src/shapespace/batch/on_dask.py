@@ -106,15 +106,15 @@ class _Run:
         size = max(1, min(LARGEST_CHUNK, len(self._tasks) // (workers * CHUNKS_A_WORKER)))
         chunks = [range(start, min(start + size, len(self._tasks))) for start in range(0, len(self._tasks), size)]
         try:
-            yield from self._each(chunks, (1 + AHEAD) * workers)
+            yield from self._run_chunks(chunks, (1 + AHEAD) * workers)
             suspects, self._suspects = self._suspects, []
-            yield from self._each([[number] for number in suspects], 1)
+            yield from self._run_chunks([[number] for number in suspects], 1)
             for number in self._suspects:
                 yield self._tasks[number], self._work.give_up(self._tasks[number], _LOST)
         finally:
             self._client.cancel(list(self._flying), force=True)
 
-    def _each(self, chunks: Sequence[Sequence[int]], at_a_time: int) -> Generator[tuple[Any, Any]]:
+    def _run_chunks(self, chunks: Sequence[Sequence[int]], at_a_time: int) -> Generator[tuple[Any, Any]]:
         from distributed import as_completed
         from distributed.scheduler import KilledWorker
 

@@ -147,15 +147,15 @@ def _attributes(entries: Sequence[_Attribute]) -> dict[str, Any]:
 
 def _value(dataset: _Dataset, path: str) -> npt.NDArray[Any] | str | None:
     """Return the content of a data set: numbers, a text, or None for other types."""
-    kind = str(_of(dataset.type, "class"))
-    base = str(_of(dataset.type, "base"))
+    kind = str(_get_item(dataset.type, "class"))
+    base = str(_get_item(dataset.type, "base"))
     if kind == "H5T_STRING":
         value = _unwrap_lists(msgspec.json.decode(dataset.value))
         return value.rstrip("\0") if isinstance(value, str) else None
     if kind not in ("H5T_FLOAT", "H5T_INTEGER"):
         return None
     number_type: Any = int if kind == "H5T_INTEGER" else float
-    dims = _of(dataset.shape, "dims")
+    dims = _get_item(dataset.shape, "dims")
     shape = cast(list[Any], dims) if isinstance(dims, list) else []
     if len(shape) > 2 or not all(isinstance(size, int) and size >= 0 for size in shape):
         return None
@@ -176,7 +176,7 @@ def _unwrap_lists(value: Any) -> Any:
     return cast(Any, value)
 
 
-def _of(value: Any, key: str) -> Any:
+def _get_item(value: Any, key: str) -> Any:
     return cast(dict[str, Any], value).get(key) if isinstance(value, dict) else None
 
 

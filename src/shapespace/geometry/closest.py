@@ -278,16 +278,16 @@ def surface_distances(
     outside, scan_outside = np.ones(len(model.vertices), dtype=bool), np.ones(len(scan.vertices), dtype=bool)
     if model.faces is not None:
         normals = vertex_normals(model)
-        outside = _in_front(forward.points - model.vertices, normals)
+        outside = _is_in_front(forward.points - model.vertices, normals)
         part_normals = normals if region is None else vertex_normals(part)
-        scan_outside = _in_front(scan.vertices - backward.points, _normals_at(backward, part, part_normals))
+        scan_outside = _is_in_front(scan.vertices - backward.points, _normals_at(backward, part, part_normals))
     return SurfaceDistances(
         forward.distance * mm_per_length, backward.distance * mm_per_length, counted, outside, scan_outside,
         region,
     )  # fmt: skip
 
 
-def _in_front(away: FloatArray, normals: FloatArray) -> BoolArray:
+def _is_in_front(away: FloatArray, normals: FloatArray) -> BoolArray:
     return np.asarray(np.einsum("ij,ij->i", away, normals) >= 0.0)
 
 

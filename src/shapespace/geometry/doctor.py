@@ -483,7 +483,7 @@ def _turn_outward(state: _RepairState, edges: _Edges, middles: FloatArray, norma
     count, patch = edges.patches()
     closed = np.ones(count, dtype=np.bool_)
     closed[patch[edges.loose]] = False
-    if closed.any() and (inside_out := _inside_out(closed, patch, middles, normals)).any():
+    if closed.any() and (inside_out := _find_inside_out(closed, patch, middles, normals)).any():
         problem = f"{_format_count(int(inside_out.sum()), 'closed piece is', 'closed pieces are')} inside out."
         action = "Its winding is reversed." if inside_out.sum() == 1 else "Their winding is reversed."
         state = state.with_triangles_reversed(inside_out[patch]).reported("fixed", problem, action)
@@ -495,7 +495,7 @@ def _turn_outward(state: _RepairState, edges: _Edges, middles: FloatArray, norma
     return state
 
 
-def _inside_out(closed: BoolArray, patch: IntArray, middles: FloatArray, normals: FloatArray) -> BoolArray:
+def _find_inside_out(closed: BoolArray, patch: IntArray, middles: FloatArray, normals: FloatArray) -> BoolArray:
     """Return the mask (P,) of `closed` patches (P,) that have a negative volume and are not the wall of a cavity."""
     from shapespace.geometry import topology  # compiled
 

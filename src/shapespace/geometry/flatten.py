@@ -43,7 +43,7 @@ def disc_map(mesh: Mesh, *, most_rounds: int = 40) -> FloatArray:
     """
     faces = faces_of(mesh)
     vertices, filled, rim = _close_holes(mesh, faces)
-    pinned = _on_rim(vertices, faces, rim)
+    pinned = _place_rim(vertices, faces, rim)
     weights = _mean_value_weights(vertices, filled)
     area = _doubled_areas(vertices, filled)
     wanted = np.sqrt(area.mean() / np.maximum(area, _SMALLEST * area.mean()))
@@ -177,7 +177,7 @@ def _loops(start: npt.NDArray[np.int64], end: npt.NDArray[np.int64]) -> list[Int
     return loops
 
 
-def _on_rim(vertices: FloatArray, faces: IntArray, rim: IntArray) -> FloatArray:
+def _place_rim(vertices: FloatArray, faces: IntArray, rim: IntArray) -> FloatArray:
     """Return the positions (R, 2) of the rim vertices by arc length, oriented as the surface in its main plane."""
     points = vertices[rim]
     steps = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)

@@ -197,14 +197,14 @@ def mirror_pairs(mesh: Mesh, mirror: SurfaceMirror) -> IntArray | None:
     nearest = np.asarray(cKDTree(x).query(mirror.image)[1], dtype=np.int32)
     if (nearest[nearest] == np.arange(len(x))).all():
         return nearest
-    other = _by_triangles(x, mirror.image, faces, nearest)
+    other = _find_pairs(x, mirror.image, faces, nearest)
     if other is None:
         return None
     far = np.linalg.norm(x[other] - mirror.image, axis=1).max()
     return other if far <= LARGEST_PAIR_SHARE * rms_size(x) else None
 
 
-def _by_triangles(x: FloatArray, image: FloatArray, faces: IntArray, nearest: IntArray) -> IntArray | None:
+def _find_pairs(x: FloatArray, image: FloatArray, faces: IntArray, nearest: IntArray) -> IntArray | None:
     across = {
         (int(face[k]), int(face[(k + 1) % 3])): int(face[(k + 2) % 3]) for face in faces for k in range(3)
     }  # fmt: skip

@@ -93,7 +93,7 @@ def align_in_place(
                 T_mean_shape = Similarity(scale, rotation, -scale * rotation @ centre)  # C18
             shapes[index] = T_mean_shape.apply(shapes[index])
             mean += shapes[index]
-        mean = _in_frame(mean / len(shapes), reference, chosen, size, with_scale)  # C19
+        mean = _move_to_frame(mean / len(shapes), reference, chosen, size, with_scale)  # C19
         moved = float(np.sqrt(((mean - previous) ** 2).sum(axis=1).mean()))
         if on_iteration is not None:
             on_iteration(iteration, moved)
@@ -158,7 +158,7 @@ def _start(first: FloatArray, chosen: IntArray | slice, size: float, with_scale:
     return mean * (size / centroid_size(mean[chosen])) if with_scale else mean
 
 
-def _in_frame(
+def _move_to_frame(
     mean: FloatArray, reference: FloatArray, chosen: IntArray | slice, size: float, with_scale: bool
 ) -> FloatArray:
     if with_scale:
@@ -263,8 +263,8 @@ def align_streamed(
             moved = np.einsum("nab,nb->na", linear, centres)
             return linear, -moved if with_scale else centre - moved  # C18
 
-        unframed = _pass(shapes, target, chosen, poses, turned)
-        mean = _in_frame(unframed, reference, chosen, size, with_scale)  # C19
+        unframed = _run_pass(shapes, target, chosen, poses, turned)
+        mean = _move_to_frame(unframed, reference, chosen, size, with_scale)  # C19
         moved = float(np.sqrt(((mean - previous) ** 2).sum(axis=1).mean()))
         if on_iteration is not None:
             on_iteration(iteration, moved)
@@ -299,13 +299,13 @@ def scale_to_tangent_streamed(shapes: Streamed, mean: FloatArray, poses: Poses) 
             furthest = max(furthest, float(np.abs(along - 1.0).max()))
             return linear / along[:, None, None], offset / along[:, None]  # C20
 
-        mean = _pass(shapes, target, slice(None), poses, scaled)
+        mean = _run_pass(shapes, target, slice(None), poses, scaled)
         if furthest < _IN_TANGENT:
             break
     return mean
 
 
-def _pass(
+def _run_pass(
     shapes: Streamed,
     target: FloatArray,
     chosen: IntArray | slice,

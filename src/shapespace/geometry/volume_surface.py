@@ -129,7 +129,7 @@ def surface_of_volume(
     chosen, wanted = _select_labels(volume, labels)
     sigma = smooth * np.cbrt(np.prod(volume.voxel_mm)) / volume.voxel_mm
     check_memory = partial(_check_memory, volume, max_memory_bytes)
-    mask, corner = _cut_out(volume, wanted, np.ceil(3 * sigma).astype(int) + 3, check_memory)
+    mask, corner = _crop_labels(volume, wanted, np.ceil(3 * sigma).astype(int) + 3, check_memory)
     part = _Solid.of(mask, keep_pieces=keep_pieces)
     check_memory(mask.shape, count_crossings(part.mask))
     if part.voxels < _FEWEST:
@@ -137,7 +137,7 @@ def surface_of_volume(
             f"{volume.name}: {_format_labels(chosen)} has only {part.voxels} "
             f"{'voxel' if part.voxels == 1 else 'connected voxels'}; a surface needs {_FEWEST}."
         )
-    at_border = _at_border(part.mask, corner, volume.labels.shape[:3])
+    at_border = _count_border_voxels(part.mask, corner, volume.labels.shape[:3])
     field, share = _smooth(part, volume.voxel_mm, sigma)
     vertices, faces = _triangles(field, volume.name)
     points = ((vertices + corner) @ volume.affine[:3, :3].T + volume.affine[:3, 3]) * RAS_TO_LPS
@@ -258,7 +258,7 @@ def _select_labels(
             f"{volume.name}: it has the {kind} {listed}; choose some (--label), or combine all (--label all)."
         )
     if labels is None or (isinstance(labels, str) and labels == "all" and labels not in places):
-        return tuple(dict.fromkeys(names)), _by_layer(present)
+        return tuple(dict.fromkeys(names)), _group_by_layer(present)
     if isinstance(labels, str):
         parts = [labels] if labels in places else [part.strip() for part in labels.split(",")]
         asked = {int(part) if part not in places and part.lstrip("-").isdecimal() else part for part in parts}
@@ -275,10 +275,10 @@ def _select_labels(
             raise InputError(
                 f"{volume.name}: {_format_labels((label,))} is in several layers; choose one of {choices}."
             )
-    return tuple(sorted(asked, key=places.__getitem__)), _by_layer([places[label][0] for label in asked])
+    return tuple(sorted(asked, key=places.__getitem__)), _group_by_layer([places[label][0] for label in asked])
 
 
-def _by_layer(places: Sequence[tuple[int, int]]) -> _Places:
+def _group_by_layer(places: Sequence[tuple[int, int]]) -> _Places:
     return {layer: [label for other, label in places if other == layer] for layer, _ in places}
 
 
@@ -286,7 +286,7 @@ def _format_labels(labels: tuple[int | str, ...]) -> str:
     return f"label{'s' if len(labels) > 1 else ''} {', '.join(map(str, labels))}"
 
 
-def _cut_out(
+def _crop_labels(
     volume: LabelVolume, wanted: _Places, margin: npt.NDArray[np.int_], check_memory: Callable[[list[int]], None]
 ) -> tuple[BoolArray, FloatArray]:
     """Return the mask of the labels `wanted` in the box around them with a margin, and its first corner (3,)."""
@@ -332,7 +332,7 @@ def count_crossings(mask: BoolArray) -> int:
     return count
 
 
-def _at_border(mask: BoolArray, corner: FloatArray, shape: tuple[int, ...]) -> int:
+def _count_border_voxels(mask: BoolArray, corner: FloatArray, shape: tuple[int, ...]) -> int:
     """Return the number of voxels of `mask`, whose first corner is `corner`, on the border of a volume of `shape`."""
     inner = tuple(
         slice(max(1 - int(offset), 0), count - 1 - int(offset)) for offset, count in zip(corner, shape, strict=True)

@@ -147,7 +147,7 @@ def atomic_path(path: Path) -> Generator[Path]:
         FileError: the folder cannot be written, or the disk is full.
     """
     path = Path(path)
-    temporary = _temporary_beside(path)
+    temporary = _make_temporary_file(path)
     try:
         yield temporary
         _move_into_place(temporary, path)
@@ -170,7 +170,7 @@ def write_together(files: Mapping[Path, Callable[[Path], object]], remove: Itera
     with contextlib.ExitStack() as stack:
         written: dict[Path, Path] = {}
         for path, write in files.items():
-            written[path] = _temporary_beside(path)
+            written[path] = _make_temporary_file(path)
             stack.callback(written[path].unlink, missing_ok=True)
             with writing(path):
                 write(written[path])
@@ -199,7 +199,7 @@ def _prefix(stem: str) -> str:
     return f"{_TEMPORARY}{_HOST}-{os.getpid()}-{stem}."
 
 
-def _temporary_beside(path: Path) -> Path:
+def _make_temporary_file(path: Path) -> Path:
     _sweep_once(path.parent)
     # The temporary file of a temporary file also contains the name of its target.
     stem = path.stem.split("-", 3)[-1] if path.name.startswith(_TEMPORARY) else path.stem

@@ -216,7 +216,7 @@ def floats(tokens: Iterable[bytes], path: Path) -> FloatArray:
         return np.fromiter(map(float, tokens), dtype=np.float64)
     except ValueError as error:
         comma = ", perhaps a decimal comma, so export it with decimal points" * ("," in str(error))
-        raise damage_error(path, f"it has text where a number should be ({_short(error)}){comma}") from error
+        raise damage_error(path, f"it has text where a number should be ({_shorten(error)}){comma}") from error
 
 
 def ints(tokens: Iterable[bytes], path: Path) -> IndexArray:
@@ -228,10 +228,10 @@ def ints(tokens: Iterable[bytes], path: Path) -> IndexArray:
     try:
         return np.fromiter(map(int, tokens), dtype=np.int64)
     except (ValueError, OverflowError) as error:
-        raise damage_error(path, f"it has text where an integer should be ({_short(error)})") from error
+        raise damage_error(path, f"it has text where an integer should be ({_shorten(error)})") from error
 
 
-def _short(error: Exception) -> str:
+def _shorten(error: Exception) -> str:
     return " ".join(str(error).rstrip(".").split())[:80]
 
 
@@ -359,7 +359,7 @@ def number_lines(values: npt.NDArray[Any], pattern: str) -> str:
 _BARE_DOCTYPE = re.compile(rb"<!DOCTYPE\s+[\w:.-]{1,80}\s*>")
 
 
-class _Plain(ET.TreeBuilder):
+class _LimitedTreeBuilder(ET.TreeBuilder):
     elements = 0
 
     def start(self, tag: str, attrs: dict[str, str], /) -> ET.Element:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -380,14 +380,14 @@ def xml_root(data: bytes, path: Path) -> ET.Element:
     """
     # MeshLab starts its files with a bare <!DOCTYPE name>, which declares nothing.
     data = _BARE_DOCTYPE.sub(b"", data, count=1)
-    parser = ET.XMLParser(target=_Plain())
+    parser = ET.XMLParser(target=_LimitedTreeBuilder())
     try:
         parser.feed(data)
         return parser.close()
     except ET.ParseError as error:
-        raise damage_error(path, f"it is not well-formed XML ({_short(error)})") from error
+        raise damage_error(path, f"it is not well-formed XML ({_shorten(error)})") from error
     except (ValueError, LookupError) as error:
-        raise damage_error(path, _short(error)) from error
+        raise damage_error(path, _shorten(error)) from error
 
 
 def json_value(data: bytes, path: Path) -> Any:
@@ -399,7 +399,7 @@ def json_value(data: bytes, path: Path) -> Any:
     try:
         return json.loads(data.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
-        raise damage_error(path, f"it is not valid JSON ({_short(error)})") from error
+        raise damage_error(path, f"it is not valid JSON ({_shorten(error)})") from error
 
 
 def check_count(declared: int, bytes_each: int, available: int, item_name: str, path: Path) -> None:

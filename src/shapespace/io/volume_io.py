@@ -313,7 +313,7 @@ def _nifti_head(start: bytes, path: Path) -> _VolumeHeader:
         shape=shape,
         kind=kind,
         start=offset,
-        affine=_in_mm(affine, _NIFTI_MM[unit]),
+        affine=_to_mm(affine, _NIFTI_MM[unit]),
         slope=slope,
         shift=shift,
         notes=notes,
@@ -506,7 +506,7 @@ def _nrrd_affine(fields: dict[str, Any], path: Path) -> tuple[FloatArray, tuple[
         raise InputError(f"{path}: its space units are not one of mm, cm, m and um; save it in mm.")
     origin = np.asarray(fields.get("space origin", np.zeros(3)), dtype=np.float64).reshape(3)
     turn = np.diag(np.array(signs or (1, 1, 1), dtype=np.float64))
-    affine = _in_mm(_affine(turn @ np.array(list(rows.values())).T, turn @ origin), MM_OF_UNITS[unit])
+    affine = _to_mm(_affine(turn @ np.array(list(rows.values())).T, turn @ origin), MM_OF_UNITS[unit])
     return affine, () if signs else (_UNORIENTED,), tuple(rows)
 
 
@@ -516,7 +516,7 @@ def _affine(steps: FloatArray, origin: FloatArray) -> FloatArray:
     return affine
 
 
-def _in_mm(affine: FloatArray, mm: float) -> FloatArray:
+def _to_mm(affine: FloatArray, mm: float) -> FloatArray:
     return _affine(affine[:3, :3] * mm, affine[:3, 3] * mm)
 
 

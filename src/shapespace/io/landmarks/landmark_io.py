@@ -304,7 +304,7 @@ def _point(values: Iterable[Any], landmark_name: str, path: Path) -> FloatArray:
     return np.array(numbers, dtype=np.float64)
 
 
-def _from_json(parse: Callable[[Any, Path], Pairs]) -> Callable[[bytes, Path], Pairs]:
+def _json_reader(parse: Callable[[Any, Path], Pairs]) -> Callable[[bytes, Path], Pairs]:
     """Return a reader of JSON in which missing or wrong values raise a `FileFormatError`."""
 
     def wrapped(data: bytes, path: Path) -> Pairs:
@@ -645,10 +645,10 @@ def _read_points(data: bytes, path: Path) -> Pairs:
 
 LANDMARK_FORMATS: Mapping[str, LandmarkFormat] = MappingProxyType(
     {
-        ".ljson": LandmarkFormat("menpo LJSON", _from_json(_ljson), _write_ljson),
+        ".ljson": LandmarkFormat("menpo LJSON", _json_reader(_ljson), _write_ljson),
         ".pp": LandmarkFormat("MeshLab picked points", _read_pp, _write_pp),
-        ".mrk.json": LandmarkFormat("3D Slicer markups", _from_json(_slicer), markups_text),
-        ".json": LandmarkFormat("scalismo", _from_json(_any_json), _write_scalismo),
+        ".mrk.json": LandmarkFormat("3D Slicer markups", _json_reader(_slicer), markups_text),
+        ".json": LandmarkFormat("scalismo", _json_reader(_any_json), _write_scalismo),
         ".csv": LandmarkFormat("CSV", _read_csv, _write_csv),
         ".fcsv": LandmarkFormat("3D Slicer fiducials", _read_fcsv, fcsv_text),
     }

@@ -41,7 +41,7 @@ _FIELDS = {b"translation": 3, b"rotation": 4, b"scale": 3, b"scaleFactor": 3, b"
 _KNOWN = {b"USE", b"ccw", b"vertexOrdering", *_FIELDS}
 
 
-def _with_points(text: bytes, path: Path) -> bytes:
+def _replace_decimal_commas(text: bytes, path: Path) -> bytes:
     """Return the coordinates of points with decimal points.
 
     Commas separate numbers in VRML. If they only separate points, fewer than half of the words contain a comma.
@@ -142,7 +142,7 @@ class _Scene:
         """Process a list of numbers."""
         node = self.stack[-1] if self.stack else _Node(b"")
         if name == b"point" and node.kind in _POINTS:
-            points = floats_of(_with_points(text, self.path).replace(b",", b" "), self.path)
+            points = floats_of(_replace_decimal_commas(text, self.path).replace(b",", b" "), self.path)
             if len(points) % 3:
                 raise damage_error(self.path, f"its points have {len(points)} numbers, not three each; {CUT_SHORT}")
             self.blocks.append((points.reshape(-1, 3), node.frame))

@@ -348,7 +348,7 @@ def _legacy_cells(cursor: _Cursor, path: Path) -> Cells:
         if cursor.word() != b"CONNECTIVITY":
             raise damage_error(path, f"its cells have OFFSETS without CONNECTIVITY; {CUT_SHORT}")
         corners = cursor.array(second, cursor.kind()).astype(np.int64)
-        return _from_offsets(offsets, corners, path)
+        return _cells_from_offsets(offsets, corners, path)
     packed = cursor.array(second, "i4").astype(np.int64)
     if first > 0 and second and second % first == 0:
         table = packed.reshape(first, -1)
@@ -367,7 +367,7 @@ def _legacy_cells(cursor: _Cursor, path: Path) -> Cells:
     return counts, packed[keep]
 
 
-def _from_offsets(offsets: IndexArray, corners: IndexArray, path: Path) -> Cells:
+def _cells_from_offsets(offsets: IndexArray, corners: IndexArray, path: Path) -> Cells:
     """Return sizes of cells and their corners, from offsets that run from 0 to the number of corners."""
     if not len(offsets):
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
@@ -450,7 +450,7 @@ def _read_xml(data: bytes, path: Path) -> tuple[Mesh, list[Cells]]:
             if not len(cell_ends):
                 continue
             xml.allowance.take(3 * len(corners), 8)
-            counts, corners = _from_offsets(np.concatenate([[0], cell_ends]), corners, path)
+            counts, corners = _cells_from_offsets(np.concatenate([[0], cell_ends]), corners, path)
             if cut is None:
                 lines.append((counts, corners + n_vertices))
                 continue
