@@ -64,7 +64,7 @@ def test_a_folder_stands_for_its_volumes_and_names_are_told_apart(run: Run, tmp_
     names = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert names == ["a.nii.gz.ply", "a.nii.ply", "masks_b.ply", "others_b.ply"]
     outcome = run("surface", tmp_path / "out", "-o", tmp_path / "out2")
-    assert outcome.code == 2 and "holds no volumes" in outcome.sentence()
+    assert outcome.code == 2 and "contains no volumes" in outcome.sentence()
 
 
 def test_a_bad_volume_among_others_is_set_aside_by_name(run: Run, tmp_path: Path) -> None:
