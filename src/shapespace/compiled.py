@@ -16,8 +16,8 @@ R = TypeVar("R")
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
     """Return `function` as machine code: float64 as written, one thread, without Python's lock.
 
-    Its Python form stays at `.py_func`, for tests. The code is kept beside the source, or where that cannot be
-    written in the user's cache folder, or where there is none either in memory alone.
+    The Python function remains at `.py_func`, for tests. The code is cached next to the source, or in the cache folder
+    of the user if the source folder is read-only, or only in memory if there is no cache folder.
     """
 
     def compile_function(*, cache: bool) -> Callable[P, R]:
@@ -25,13 +25,13 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
 
     try:
         return compile_function(cache=True)
-    except RuntimeError:  # no folder for the cache
+    except RuntimeError:  # there is no folder for the cache
         return compile_function(cache=False)
 
 
 @contextmanager
 def notify_compilation(notify: Callable[[], None]) -> Generator[None]:
-    """Call `notify` once before any code is compiled in this block; code read from disk does not count."""
+    """Call `notify` once before code is compiled in this block; code that is read from disk does not count."""
 
     class _FirstCompilation(cast(Any, event).Listener):
         has_notified = False

@@ -1,7 +1,7 @@
-"""Both experiments of the paper, from the bundled faces to one report.
+"""The two experiments of the paper, from the bundled faces to a report.
 
-Experiment 1: expressions of one person. Experiment 2: a model of many people and a scan of somebody else. Everything
-is written as plain files, and the report reads nothing but those.
+Experiment 1: expressions of one person. Experiment 2: a model of many people, and a scan of another person. All results
+are written as plain files, and the report reads only these files.
 """
 
 from __future__ import annotations
@@ -59,13 +59,13 @@ _MAIN_MODES_SHARE = 0.9  # share of the variance of the modes that the fit with 
 
 @dataclass(frozen=True)
 class DemoScale:
-    """How large the demo is.
+    """Counts and sizes of the demo.
 
     Args:
-        training: faces and people that each model is made of.
-        triangles: of the simulated scans.
+        training: number of training faces of each model.
+        triangles: number of triangles of the simulated scans.
         levels: intensities of each test expression.
-        stop_motion_mm: largest vertex motion at which the fits stop.
+        stop_motion_mm: largest vertex motion at which the fits stop, mm.
     """
 
     training: int = 100
@@ -76,11 +76,11 @@ class DemoScale:
 
 FULL = DemoScale()
 QUICK = DemoScale(triangles=30_000, stop_motion_mm=5e-2)
-"""The quick demo keeps the paper's counts; its scans are coarser and its fits stop earlier."""
+"""Scale of the quick demo: the counts of the paper, coarser scans, and fits that stop earlier."""
 
 
 class _Clock:
-    """A progress bar of the whole demo that is silent without a terminal, and the seconds each part took."""
+    """A progress bar of the complete demo, hidden without a terminal, and the duration of each part in seconds."""
 
     def __init__(self, total: int, *, quiet: bool) -> None:
         self.bar = tqdm(total=total, unit="step", leave=False, disable=True if quiet else None)
@@ -101,10 +101,10 @@ def run_demo(folder: Path, *, quick: bool = False, quiet: bool = False, scale: D
     """Run both experiments into `folder` and return the path of the report.
 
     Args:
-        folder: made if absent; results of an earlier demo in it are replaced.
-        quick: coarser scans and fewer iterations, under a minute.
-        quiet: no progress bar.
-        scale: counts and sizes; None goes by `quick`.
+        folder: output folder, which is created if missing; results of an earlier demo in it are replaced.
+        quick: whether to use coarser scans and fewer iterations, which takes less than a minute.
+        quiet: whether to hide the progress bar.
+        scale: counts and sizes of the demo; None for those that `quick` selects.
 
     Raises:
         FileError: the folder cannot be written.
@@ -141,7 +141,7 @@ def run_demo(folder: Path, *, quick: bool = False, quiet: bool = False, scale: D
 
 
 def _experiment_1(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _Clock) -> ExpressionsOfOne:
-    """One person: 100 mixed expressions make the model, 16 unseen expressions and a neutral face are fitted."""
+    """Run experiment 1: fit a model of 100 mixed expressions of one person to 16 new expressions and a neutral face."""
     rng = np.random.default_rng(_SEED)
     home = make_folder(folder / "experiment1")
     person = faces.draw_person(rng)
@@ -149,7 +149,7 @@ def _experiment_1(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _
     everything = ShapeModel.fit(
         training,
         gauge="shape",
-        # Jaw and lips must not pull the pose along, so forehead and nose carry the alignment.
+        # Jaw and lips must not affect the pose, so only forehead and nose are aligned.
         alignment_vertices=faces.regions["semi_rigid"],
         landmarks=faces.landmarks,
         provenance=f"{scale.training} mixed expressions of one simulated person",
@@ -169,7 +169,7 @@ def _experiment_1(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _
         pose = random_similarity(rng, max_angle_deg=20.0, scale_range=(0.9, 1.1), translation_mm=100.0)
         scans[name] = simulate_scan(truth, rng, triangles=scale.triangles, noise_mm=0.2, T_scan_model=pose, name=name)
         labels[name] = (expression, level)
-    fits = _fit_all(home, model, scans, labels, _paper(scale), clock)
+    fits = _fit_all(home, model, scans, labels, _paper_config(scale), clock)
 
     make_folder(home / "training")
     examples: list[Example] = []
@@ -193,7 +193,7 @@ def _experiment_1(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _
 
 
 def _scores(folder: Path, fits: Sequence[FitEntry]) -> dict[str, Any]:
-    """Return whether each expression is a line through neutral, and whether they are disjoint, by trusted fits."""
+    """Return whether trusted fits of each expression are on a line through neutral, and whether lines are disjoint."""
     trusted = [fit for fit in fits if fit.status in ("converged", "max_iterations")]
     scores: dict[str, Any] = {"left_out": [fit.name for fit in fits if fit not in trusted]}
     z = {fit.name: np.array(_record(folder, fit).z) for fit in trusted}
@@ -204,7 +204,7 @@ def _scores(folder: Path, fits: Sequence[FitEntry]) -> dict[str, Any]:
     for expression in PAPER_EXPRESSIONS:
         own = [i for i, fit in enumerate(tests) if fit.expression == expression]
         if len(own) < 3:
-            continue  # too few trusted fits for a line; `left_out` names the others
+            continue  # too few trusted fits for a line; `left_out` lists the others
         line = line_scores(v[own], np.array([tests[i].intensity for i in own]))
         for key, value in asdict(line).items():
             scores.setdefault(f"line_{key}", {})[expression] = value
@@ -218,7 +218,7 @@ def _record(folder: Path, fit: FitEntry) -> FitRecord:
 
 
 def _experiment_2(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _Clock) -> ManyPeople:
-    """Many people: 100 neutral faces make the model, and scans of somebody else are fitted."""
+    """Run experiment 2: fit a model of 100 neutral faces to scans of other people."""
     rng = np.random.default_rng(_SEED + 1)
     home = make_folder(folder / "experiment2")
     people = [faces.face(faces.draw_person(rng), name=f"person_{i:03}") for i in range(scale.training)]
@@ -258,18 +258,18 @@ def _experiment_2(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _
     if james_available():
         james = load_james()
         if ict_available():
-            note = "A real scan with hair and collar; the model is made of statistics of real people."
+            note = "A real scan with hair and collar; the model consists of statistics of real people."
             title = "James, a real 3dMD scan, with a model of ICT-FaceKit people"
             story.append(_Story("ict", _ict_model(scale), james, title, "James, ICT model", note))
             clock.step("model of ICT people")
         main_modes = bundled.truncate(bundled.modes_for_variance(_MAIN_MODES_SHARE) or bundled.n_modes)
         title = "James, a real 3dMD scan, with the bundled model"
         note = (
-            "A real scan with hair and collar; the model knows only simulated people, shows ears that his hair covers, "
-            "and is held to the modes with 90 % of its variance."
+            "A real scan with hair and collar; the model contains only simulated people, includes ears, which his hair "
+            "covers, and is restricted to the modes with 90 % of its variance."
         )
         story.append(_Story("bundled_main", main_modes, james, title, "James, bundled model", note))
-    return ManyPeople(folder="experiment2", cases=tuple(_case(home, one, scale, clock) for one in story))
+    return ManyPeople(folder="experiment2", cases=tuple(_case(home, entry, scale, clock) for entry in story))
 
 
 def _ict_model(scale: DemoScale) -> ShapeModel:
@@ -287,7 +287,7 @@ def _ict_model(scale: DemoScale) -> ShapeModel:
 
 @dataclass(frozen=True, eq=False)
 class _Story:
-    """A scan of experiment 2, the model that it is fitted by, and what is said of both."""
+    """A scan of experiment 2, its model, and a title and a note for the report."""
 
     model_name: str
     model: ShapeModel
@@ -298,13 +298,13 @@ class _Story:
 
 
 def _case(home: Path, story: _Story, scale: DemoScale, clock: _Clock) -> Case:
-    """Fit one scan of experiment 2 and return its entry."""
+    """Fit a scan of experiment 2 and return its entry."""
     model, file = story.model, f"{story.model_name}_model.h5"
     if not (home / file).exists():
         model.save(home / file)
     mesh = story.scan.scan if isinstance(story.scan, SimulatedScan) else story.scan
     name = f"{Path(mesh.name).stem}_{story.model_name}"
-    paper = _paper(scale)
+    paper = _paper_config(scale)
     fit, robust = (
         _fit_all(
             home=home,
@@ -333,7 +333,7 @@ def _case(home: Path, story: _Story, scale: DemoScale, clock: _Clock) -> Case:
     )
 
 
-def _paper(scale: DemoScale) -> FitConfig:
+def _paper_config(scale: DemoScale) -> FitConfig:
     """Return the settings of the paper's method."""
     return FitConfig(Paper(stop_motion_mm=scale.stop_motion_mm))
 
@@ -347,7 +347,7 @@ def _fit_all(
     clock: _Clock,
     model_name: str = "model.h5",
 ) -> list[FitEntry]:
-    """Write `scans` as files, fit them as the command line does, and return an entry each."""
+    """Write `scans` as files, fit them like the command line, and return an entry for each scan."""
     make_folder(home / "scans")
     for name, scan in scans.items():
         write_mesh(home / "scans" / f"{name}.ply", scan.scan if isinstance(scan, SimulatedScan) else scan)
@@ -391,29 +391,29 @@ def _fit_all(
 
 
 def _vertex_error(vertices: FloatArray, scan: SimulatedScan) -> VertexErrors:
-    """Return how far `vertices`, in the scan's frame, lie from the true ones, mm of the scan."""
+    """Return the distances of `vertices`, in the frame of the scan, from the true vertices, mm of the scan."""
     error = np.linalg.norm(vertices - scan.truth_vertices, axis=1)
     return VertexErrors(mean=float(error.mean()), rms=float(np.sqrt((error**2).mean())), max=float(error.max()))
 
 
 def _floor(model: ShapeModel, scan: SimulatedScan) -> VertexErrors:
-    """Return the same for the model's best reconstruction from true correspondences: no fit can do much better."""
+    """Return the vertex error of the best reconstruction from true correspondences, a lower bound for fits."""
     best = model.reconstruct(model.project(scan.truth_vertices))
     return _vertex_error(fit_similarity(best, scan.truth_vertices).apply(best), scan)
 
 
 def _paper_table(folder: Path, first: ExpressionsOfOne, second: ManyPeople) -> list[Claim]:
-    """Return what the paper states beside what this run measured."""
+    """Return the results of the paper with the corresponding results of this run."""
     tests = [fit for fit in first.fits if fit.stages and fit.expression != "neutral"]
     distances = [_to_scan(folder, fit) for fit in tests]
     worst = sorted(distances, key=lambda stages: -stages["before"].max)[:2]
     largest, means = [stages["final"].max for stages in distances], [stages["final"].mean for stages in distances]
     errors = [fit.vertex_error_mm for fit in tests if fit.vertex_error_mm]
     floors = [fit.floor_mm for fit in tests if fit.floor_mm]
-    spectrum = "Our simulated expressions mix other muscles than the paper's, so the spectrum falls differently."
+    spectrum = "Our simulated expressions mix other muscles than those of the paper, so the spectrum differs."
     return [
         Claim(
-            quantity="Modes that hold 98.5 % of the variance, one person's expressions",
+            quantity="Modes with 98.5 % of the variance, expressions of one person",
             paper="5",
             measured=str(first.modes_for_98_5),
             why=None if first.modes_for_98_5 == 5 else spectrum,
@@ -421,8 +421,8 @@ def _paper_table(folder: Path, first: ExpressionsOfOne, second: ManyPeople) -> l
         Claim(
             quantity="Largest closest distance, before → after phase 1 (the two test faces that start farthest)",
             paper="60 → 10 mm; 54 → 6 mm",
-            measured="; ".join(f"{one['before'].max:.0f} → {one['initial'].max:.1f} mm" for one in worst),
-            why="Where a scan starts is arbitrary: ours start with centroids together and up to 20 degrees off.",
+            measured="; ".join(f"{stages['before'].max:.0f} → {stages['initial'].max:.1f} mm" for stages in worst),
+            why="The start pose of a scan is arbitrary: ours have equal centroids and rotations of up to 20 degrees.",
         ),
         Claim(
             quantity="Largest closest distance after phase 2, over the test faces",
@@ -430,22 +430,22 @@ def _paper_table(folder: Path, first: ExpressionsOfOne, second: ManyPeople) -> l
             measured=f"{max(largest):.2f} mm at most, {np.median(largest):.2f} mm typically",
             truth=f"true vertex error {max(error.max for error in errors):.2f} mm at most (floor "
             f"{max(floor.max for floor in floors):.2f} mm)",
-            why="Ours is measured to the scan's triangles and carries 0.2 mm noise; the paper does not say how it "
-            "measures.",
+            why="Ours is measured to the triangles of the scan, with 0.2 mm noise; the paper does not state its "
+            "method.",
         ),
         Claim(
             quantity="Mean closest distance after phase 2, over the test faces",
             paper="1.24 mm",
             measured=f"{np.mean(means):.2f} mm",
             truth=_truth(np.mean([error.mean for error in errors]), np.mean([floor.mean for floor in floors])),
-            why="Our faces are sampled more finely, so closest points lie nearer; the true error is what counts.",
+            why="Our faces are sampled more finely, so closest points are nearer; only the true error is comparable.",
         ),
         *(_claim(folder, case) for case in second.cases),
     ]
 
 
 def _claim(folder: Path, case: Case) -> Claim:
-    """Return what the paper states of its real scan beside one case of experiment 2."""
+    """Return the result of the paper for its real scan with that of a case of experiment 2."""
     fit, truth = case.fit, None
     measured = f"failed: {fit.reason}"
     if fit.stages:
@@ -465,7 +465,7 @@ def _claim(folder: Path, case: Case) -> Claim:
         why="Hair, collar and holes have no counterpart in the model, and the plain method forces a match for every "
         "vertex."
         if case.simulated
-        else "Another scan and another model than the paper's, with more modes.",
+        else "Another scan and another model than those of the paper, with more modes.",
     )
 
 
@@ -473,8 +473,8 @@ def _to_scan(folder: Path, fit: FitEntry) -> dict[str, VertexErrors]:
     """Return the distances from the model to the scan by stage, mm."""
     distances = {stage: both.model_to_scan for stage, both in _record(folder, fit).distances_mm.items()}
     return {
-        stage: VertexErrors(mean=one.mean or 0.0, rms=one.rms or 0.0, max=one.max or 0.0)
-        for stage, one in distances.items()
+        stage: VertexErrors(mean=values.mean or 0.0, rms=values.rms or 0.0, max=values.max or 0.0)
+        for stage, values in distances.items()
     }
 
 

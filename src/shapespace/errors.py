@@ -18,7 +18,7 @@ class InputError(ShapespaceError, ValueError):
 
 
 class MeshError(InputError):
-    """A surface cannot be used: no points, not finite, degenerate, or faces that point nowhere."""
+    """A surface cannot be used: no points, not finite, degenerate, or faces with invalid indices."""
 
 
 class CorrespondenceError(InputError):
@@ -26,11 +26,11 @@ class CorrespondenceError(InputError):
 
 
 class FileError(ShapespaceError, OSError):
-    """A file cannot be read or written; the sentence names it."""
+    """A file cannot be read or written; the message names the file."""
 
 
 class FileFormatError(FileError, ValueError):
-    """A file is not in the format it claims, or it is cut short or damaged."""
+    """A file is not in the expected format, or it is cut short or damaged."""
 
 
 class ModelFileError(FileFormatError):
@@ -42,4 +42,4 @@ class DataError(ShapespaceError):
 
 
 class FitError(ShapespaceError):
-    """A scan cannot be fitted at all; a poor fit is a result with a status instead."""
+    """A scan cannot be fitted; a poor fit is not an error but a result with a status."""

@@ -1,7 +1,7 @@
-"""Lazy imports of functions in higher layers, and of packages that are not required.
+"""Lazy imports of functions in higher layers, and of optional packages.
 
-Imports point down only. A model can be plotted and a result saved all the same, since their methods look up here who
-does it: this list is all there is of that.
+Modules import only from lower layers. Methods of models and results, such as plots, nevertheless need functions of
+higher layers, which they find in `LAZY_FUNCTIONS`, the complete list of these exceptions.
 """
 
 from __future__ import annotations
@@ -47,19 +47,19 @@ LAZY_FUNCTIONS: Mapping[str, str] = MappingProxyType(
         "write_mesh": "io.meshes.mesh_io",
     }
 )
-"""Function -> its module, which is imported when the function is first asked for."""
+"""Function -> its module, which is imported at the first use of the function."""
 
 
 class OpenViewer(Protocol):
-    """A viewer in a notebook, or beside a prompt; it runs until `close`, or until the process ends."""
+    """A viewer in a notebook or an interactive session; it runs until `close` or the end of the process."""
 
     @property
     def address(self) -> str:
-        """The address with the token, for a tab of a browser on this machine."""
+        """Address with the token, for a browser on this machine."""
         ...
 
     def close(self) -> None:
-        """End the viewer, and remove its files; it may be called twice."""
+        """End the viewer and remove its files; repeated calls are allowed."""
         ...
 
 
@@ -81,11 +81,11 @@ def lazy_names(
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """Return `__getattr__` and `__dir__` of a package whose names are imported when they are first used.
 
-    SciPy takes most of a second to import, and `shapespace --help` needs none of it.
+    The import of SciPy takes most of a second, and `shapespace --help` does not need it.
 
     Args:
-        package: its name.
-        modules: module, without `shapespace.` -> the names that the package has from it.
+        package: name of the package.
+        modules: name of a module without `shapespace.` -> names that the package exports from it.
     """
     homes = {name: module for module, names in modules.items() for name in names}
 
@@ -101,12 +101,12 @@ def require_package(module: str, purpose: str, install: str = "") -> Any:
     """Return a module of a package that shapespace does not require.
 
     Args:
-        module: its name.
-        purpose: needs it, at the beginning of a sentence.
-        install: what pip is to install, where that is not called as the module.
+        module: name of the module.
+        purpose: feature that needs the module, as the subject of a sentence.
+        install: argument of pip install, if it differs from the name of the module.
 
     Raises:
-        ShapespaceError: it is not installed, or cannot be imported.
+        ShapespaceError: the package is not installed, or cannot be imported.
     """
     try:
         return import_module(module)
@@ -115,5 +115,5 @@ def require_package(module: str, purpose: str, install: str = "") -> Any:
         if isinstance(error, ModuleNotFoundError) and error.name == package:
             cause = f"which is not installed; run pip install {install or package}."
         else:
-            cause = f"which is installed and cannot be loaded ({error}); see how it is to be installed."
+            cause = f"which is installed but cannot be loaded ({error}); see its installation instructions."
         raise ShapespaceError(f"{purpose} needs {package}, {cause}") from error

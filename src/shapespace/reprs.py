@@ -11,13 +11,13 @@ import numpy.typing as npt
 
 _SMALL = 9  # elements; a rotation matrix is printed in full
 _MOST_NAMES = 4  # entries in one line
-_LONGEST = 80  # characters; a terminal's line
+_LONGEST = 80  # characters of a line in a terminal
 
 
 def short_repr(self: Any) -> str:
     """Return the fields of a dataclass in one line: arrays by shape and type, long sequences by length.
 
-    It stands in a class as `__repr__ = short_repr`.
+    A class uses it as `__repr__ = short_repr`.
     """
     shown_fields = (f"{item.name}={describe_briefly(getattr(self, item.name))}" for item in fields(self) if item.repr)
     return f"{type(self).__name__}({', '.join(shown_fields)})"
@@ -37,28 +37,28 @@ def list_briefly(parts: Sequence[str]) -> str:
 def describe_briefly(value: Any) -> str:
     """Return a short text for `value`, without computing or reading anything."""
     if isinstance(value, np.ndarray):
-        return _of_array(cast(npt.NDArray[Any], value))
+        return _describe_array(cast(npt.NDArray[Any], value))
     if isinstance(value, Mapping):
-        return _of_mapping(cast(Mapping[object, object], value))
+        return _describe_mapping(cast(Mapping[object, object], value))
     if isinstance(value, list | tuple):
         items = cast(Sequence[object], value)
         if len(items) > _MOST_NAMES or any(not isinstance(item, str | int | float) for item in items):
             return f"<{len(items)} items>"
-    return f"{value:.6g}" if isinstance(value, float) else _of_other(cast(object, value))
+    return f"{value:.6g}" if isinstance(value, float) else _describe_other(cast(object, value))
 
 
-def _of_mapping(value: Mapping[object, object]) -> str:
+def _describe_mapping(value: Mapping[object, object]) -> str:
     names = [str(name) for name in value]
     others_note = f", and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
     return "{" + ", ".join(_clip(name) for name in names[:_MOST_NAMES]) + others_note + "}"
 
 
-def _of_other(value: object) -> str:
+def _describe_other(value: object) -> str:
     text = repr(value)
     return f"{type(value).__name__}(…)" if is_dataclass(value) and len(text) > _LONGEST else _clip(text)
 
 
-def _of_array(array: npt.NDArray[Any]) -> str:
+def _describe_array(array: npt.NDArray[Any]) -> str:
     if array.size <= _SMALL and array.dtype.kind in "iufb":
         return " ".join(np.array2string(array, precision=4, separator=", ").split())
     return f"<{' x '.join(map(str, array.shape))} {array.dtype}>"
@@ -69,7 +69,7 @@ def _clip(text: str) -> str:
 
 
 def describe_groups(groups: Sequence[Sequence[str]]) -> str:
-    """Return a sentence on the groups of scans of a correspondence; empty if all are of one kind."""
+    """Return a sentence on the groups of scans of a correspondence; empty if all belong to one group."""
     if not groups:
         return ""
     others = (f"{len(group)} are alike and differ from them" for group in groups[1:])

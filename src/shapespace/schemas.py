@@ -1,8 +1,8 @@
-"""What the result files hold, for writers and readers: NAME.fit.json, demo.json, recognition.json, quality.json.
+"""Content of result files, for writers and readers: NAME.fit.json, demo.json, recognition.json, quality.json.
 
-Each file is a frozen `Struct`: what a dataclass is, made in a tenth of the time, checked by msgspec. `to_json` turns
-one into plain JSON; `from_json`, or `read` for a part of a file, checks what was found and says in one sentence what is
-wrong with it. Keys that a version does not know are passed over, so that what later versions add can be read.
+Each file is a frozen `Struct` of msgspec, which is created ten times as fast as a dataclass and checks its content.
+`to_json` converts an object to plain JSON; `from_json`, or `read` for a part of a file, checks the content and raises
+an error with one sentence. Unknown keys are ignored, so that files of later versions with additional keys can be read.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from shapespace.errors import FileFormatError
 Status = Literal["converged", "max_iterations", "doubtful", "failed"]
 FIT_AGAIN, STUDY_AGAIN, DEMO_AGAIN = "fit the scan again", "run shapespace recognise study again", "run the demo again"
 CORRESPOND_AGAIN, ANALYSIS_AGAIN = "run shapespace correspond again", "run the analysis again"
-_TOLD = 200  # characters of a library's error that a message repeats
+_LONGEST_REASON = 200  # characters of the error of a library in a message
 _T = TypeVar("_T")
 
 
@@ -29,51 +29,51 @@ def read(kind: type[_T], content: object, where: str, again: str) -> _T:
     """Return JSON content as an object of `kind`, a class of this module or a plain type.
 
     Args:
-        kind: what it is to be.
-        content: as `json.loads` gives it.
-        where: the file, or the part of it, for the sentence.
-        again: what a reader can do about it.
+        kind: class of the result.
+        content: JSON content as from `json.loads`.
+        where: name of the file or of its part, used in the message.
+        again: advice for the user, as the end of the message.
 
     Raises:
-        FileFormatError: it is something else.
+        FileFormatError: the content is not of this class.
     """
     try:
         return msgspec.convert(content, kind)
     except (msgspec.ValidationError, UnicodeEncodeError, OverflowError, RecursionError) as error:
-        message = str(error)[:_TOLD].replace("`", "").replace("$.", "").replace("Object missing", "missing")
+        message = str(error)[:_LONGEST_REASON].replace("`", "").replace("$.", "").replace("Object missing", "missing")
         raise FileFormatError(f"{where} is damaged: {message[:1].lower()}{message[1:]}; {again}.") from error
 
 
 def to_json(content: object) -> Any:
-    """Return a class of this module, or anything made of plain values, as JSON has it.
+    """Return an object of this module, or of plain values, as JSON content.
 
-    Numbers that are not finite become null, and numbers of numpy plain ones.
+    Numbers that are not finite become None, and numbers of numpy become plain numbers.
     """
-    return _finite(msgspec.to_builtins(content, enc_hook=lambda value: value.item()))
+    return _replace_non_finite(msgspec.to_builtins(content, enc_hook=lambda value: value.item()))
 
 
 def json_text(content: object) -> str:
-    """Return what `to_json` gives as the text of a file."""
+    """Return the result of `to_json` as the text of a file."""
     return json.dumps(to_json(content), indent=1, allow_nan=False) + "\n"
 
 
-def _finite(value: Any) -> Any:
+def _replace_non_finite(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
-        return {str(key): _finite(item) for key, item in cast(dict[Any, Any], value).items()}
+        return {str(key): _replace_non_finite(item) for key, item in cast(dict[Any, Any], value).items()}
     if isinstance(value, list | tuple):
-        return [_finite(item) for item in cast(Sequence[Any], value)]
+        return [_replace_non_finite(item) for item in cast(Sequence[Any], value)]
     return value
 
 
 def check_format(
     content: object, kind: type[FitRecord] | type[CorrespondenceRecord] | type[Recognition], where: str, again: str
 ) -> None:
-    """Refuse what is not a file of the format of `kind` and its version; a file without a version is of the first.
+    """Check the format and version of the content of a file; a file without a version has the first version.
 
     Raises:
-        FileFormatError: it is not.
+        FileFormatError: the content has another format or version.
     """
     known: Mapping[str, Any] = cast(dict[str, Any], content) if isinstance(content, dict) else {}
     if known.get("format") != kind.FORMAT:
@@ -81,7 +81,7 @@ def check_format(
     version = known.get("format_version", 1)
     if version != kind.VERSION:
         raise FileFormatError(
-            f"{where} has the format version {str(version)[:40]}, of which this version of shapespace knows only "
+            f"{where} has the format version {str(version)[:40]}, but this version of shapespace supports only "
             f"{kind.VERSION}; update shapespace, or {again}."
         )
 
@@ -90,12 +90,12 @@ def check_format(
 
 
 class File(Struct, frozen=True, kw_only=True):
-    """A file that took part: its name, the SHA-256 of its content, and where it was, empty where that is not known.
+    """Reference to an input file: its name, the SHA-256 of its content, and its path; empty if unknown.
 
     Args:
-        size_bytes: of a scan, and
-        modified_ns: when it was last written (ns since 1970), by which it is known again without reading it.
-        remote_version: of a scan that lies elsewhere, at the address `path`, a word that changes with it.
+        size_bytes: size of a scan, bytes.
+        modified_ns: modification time of a scan, ns since 1970; with the size it identifies an unchanged scan.
+        remote_version: version of a remote scan at the address `path`, which changes with its content.
     """
 
     name: str = ""
@@ -107,7 +107,7 @@ class File(Struct, frozen=True, kw_only=True):
 
 
 class Distances(Struct, frozen=True, kw_only=True):
-    """Closest distances in mm, None where there is none, how many they are and which share of the points counted."""
+    """Statistics of closest distances, mm (None without distances), their count, and the fraction of used points."""
 
     mean: float | None = None
     median: float | None = None
@@ -119,7 +119,7 @@ class Distances(Struct, frozen=True, kw_only=True):
 
 
 class BothWays(Struct, frozen=True, kw_only=True):
-    """Distances from the model's vertices to the scan, and from the scan's points to the model."""
+    """Distances from the vertices of the model to the scan, and from the points of the scan to the model."""
 
     model_to_scan: Distances = Distances()
     scan_to_model: Distances = Distances()
@@ -129,8 +129,8 @@ class OverlapDistances(BothWays, frozen=True, kw_only=True):
     """Distances over the parts that scan and model both contain.
 
     Args:
-        model_seen_share: share of the model's vertices that the scan shows, 0 to 1.
-        scan_covered_share: share of the scan's points that lie within the model, 0 to 1.
+        model_seen_share: share of the vertices of the model that the scan shows, 0 to 1.
+        scan_covered_share: share of the points of the scan within the model, 0 to 1.
     """
 
     model_seen_share: float | None = None
@@ -146,7 +146,7 @@ class Pose(Struct, frozen=True, kw_only=True):
 
 
 class Iteration(Struct, frozen=True, kw_only=True):
-    """One step of a fit; lengths in mm of the scan."""
+    """One iteration of a fit; lengths in mm of the scan."""
 
     phase: int
     iteration: int
@@ -159,8 +159,9 @@ class FoundLandmark(Struct, frozen=True, kw_only=True):
     """A landmark of the model on the fitted surface.
 
     Args:
-        at: in the scan's own frame and unit.
-        stddev_mm: along the axes of that frame, mm of the scan; None where the method finds none.
+        at: position in the frame and unit of the scan.
+        stddev_mm: standard deviations along the axes of that frame, mm of the scan; None if the method does not
+            estimate these.
     """
 
     at: tuple[float, float, float]
@@ -172,7 +173,7 @@ class ReasonRecord(Struct, frozen=True, kw_only=True):
 
     Args:
         code: a value of `fit.reasons.ReasonCode`, or one of a later version.
-        data: its numbers by name.
+        data: numbers of the reason by name.
     """
 
     code: str
@@ -185,31 +186,32 @@ class FitRecord(Struct, frozen=True, kw_only=True):
     Lengths are in mm of the scan, except coefficients, which are in mm of the model's frame.
 
     Args:
-        id: SHA-256 of scan, model, landmarks, settings and version; the fitted surface's header has it too. Empty for a
+        id: SHA-256 of scan, model, landmarks, settings and version, also contained in the header of the fitted surface.
+            Empty for a scan that could not be fitted.
+        metadata: metadata of the scan, by the columns of the list of scans.
+        given_up: identifier of the run that gave up the scan because its workers crashed; otherwise empty.
+        status: status of the fit; `unreadable` represents a record that cannot be read, and is never in a file.
+        reason: sentence that explains the status.
+        reasons: reasons for the status as codes with data; empty for a scan that could not be fitted.
+        scan: reference to the file of the scan.
+        model: reference to the file of the model.
+        landmarks: reference to the file of the initial landmarks.
+        T_scan_model: pose of the model in the frame and unit of the scan. This and the following fields are None for a
             scan that could not be fitted.
-        metadata: of the scan, by the columns of the list that named it.
-        given_up: of a scan that its workers did not survive, the run that gave it up; else empty.
-        status: the verdict; `unreadable` stands in place of a record that cannot be read, and in no file.
-        reason: one sentence on why.
-        reasons: the same as codes with data; empty for a scan that could not be fitted.
-        scan: the scan.
-        model: the model.
-        landmarks: the landmarks from which the fit started.
-        T_scan_model: pose, in the scan's own frame and unit; None for a scan that could not be fitted, as are the rest.
-        b: (K,) coefficients in mm of the model's frame: norms over all vertices, so that b over the root of
-            `n_vertices` is the RMS by which a mode moves a vertex,
-        z: and in standard deviations.
-        b_stddev: (K,) mm of the model's frame.
-        shrinkage: (K,) in [0, 1].
-        found_landmarks: the model's landmarks, on the dense surface where there is one, by name.
-        distances_mm: by stage, over the whole model and every scan point within its rim.
-        size_mm: root mean square distance of the fitted surface's vertices from their middle.
-        n_vertices: of that surface, V.
-        centroid_size_mm: root of the sum of those squares, which is size_mm times the root of V.
-        extents_mm: of that surface along its principal axes, the longest first,
-        area_mm2: and its area; None without triangles.
-        shown: distances of the final stage over what the scan shows.
-        shown_dense: of the dense surface, where there is one.
+        b: (K,) coefficients, mm in the frame of the model. They are norms over all vertices: b divided by the root of
+            `n_vertices` is the RMS displacement of a vertex by a mode.
+        z: (K,) coefficients in standard deviations.
+        b_stddev: (K,) standard deviations of `b`, mm in the frame of the model.
+        shrinkage: (K,) shrinkage of the coefficients, 0 to 1.
+        found_landmarks: landmarks of the model by name, on the dense surface if there is one.
+        distances_mm: distances by stage, over all vertices of the model and all scan points within its rim.
+        size_mm: root mean square distance of the vertices of the fitted surface from their centroid, mm.
+        n_vertices: number of vertices of the fitted surface, V.
+        centroid_size_mm: centroid size of the fitted surface, `size_mm` times the root of V, mm.
+        extents_mm: extents of the fitted surface along its principal axes, the longest first, mm.
+        area_mm2: area of the fitted surface, mm^2; None without triangles.
+        shown: overlap distances of the final stage.
+        shown_dense: overlap distances of the dense surface, if there is one.
     """
 
     CALLED: ClassVar = "the record of a fit"
@@ -261,7 +263,7 @@ class FitRecord(Struct, frozen=True, kw_only=True):
         return self.status not in ("failed", "unreadable")
 
     def to_json(self) -> dict[str, Any]:
-        """Return the content of the file; a failed scan has no keys of a fit, and a fit none that do not apply."""
+        """Return the content of the file; a failed scan has no keys of a fit, and a fit has only keys that apply."""
         content: dict[str, Any] = to_json(self)
         for key in ("scan", "model", "landmarks"):
             if content[key]:
@@ -272,10 +274,10 @@ class FitRecord(Struct, frozen=True, kw_only=True):
 
     @staticmethod
     def from_json(content: object, where: str, again: str = FIT_AGAIN) -> FitRecord:
-        """Return a record, checked.
+        """Return a checked record.
 
         Raises:
-            FileFormatError: it is no record of a fit, of another version, or damaged.
+            FileFormatError: it is not the record of a fit, has another version, or is damaged.
         """
         check_format(content, FitRecord, where, again)
         return read(FitRecord, content, where, again)
@@ -284,14 +286,14 @@ class FitRecord(Struct, frozen=True, kw_only=True):
 _OF_FILES = frozenset(("name", "hash"))
 _OF_FAILED = frozenset(("reason", "config"))
 _NOT_ALWAYS = frozenset(("metadata", "shown_dense", "area_mm2", "found_landmarks", "given_up"))
-"""Keys of a fit that are left out where they are empty."""
+"""Keys of a fit that are omitted if they are empty."""
 
 
 # demo.json
 
 
 class VertexErrors(Struct, frozen=True, kw_only=True):
-    """Distances between vertices that correspond, mm."""
+    """Distances between corresponding vertices, mm."""
 
     mean: float
     rms: float
@@ -299,14 +301,14 @@ class VertexErrors(Struct, frozen=True, kw_only=True):
 
 
 class FitEntry(Struct, frozen=True, kw_only=True):
-    """One fit beside its record: what was fitted, and the files it left, relative to the folder of the results.
+    """A fit of the demo: its subject, and the paths of its files relative to the folder of the results.
 
     Args:
-        intensity: of the expression, 0 to 1; None where it is not known.
-        subject: whom the scan shows; empty where that is not known.
-        json: the record.
-        vertex_error_mm: to the truth, where it is known,
-        floor_mm: and of the model's best reconstruction of it.
+        intensity: intensity of the expression, 0 to 1; None if unknown.
+        subject: name of the person in the scan; empty if unknown.
+        json: path of the record.
+        vertex_error_mm: distances of the vertices from the true positions, mm, if these are known.
+        floor_mm: distances of the best reconstruction by the model from the true positions, mm.
     """
 
     name: str
@@ -325,7 +327,7 @@ class FitEntry(Struct, frozen=True, kw_only=True):
 
 
 class Example(Struct, frozen=True, kw_only=True):
-    """A mesh of the training set, kept to be shown."""
+    """A mesh of the training set for the report."""
 
     file: str
     label: str = ""
@@ -344,11 +346,11 @@ class DemoModel(Struct, frozen=True, kw_only=True):
 
 
 class ExpressionsOfOne(DemoModel, frozen=True, kw_only=True):
-    """Experiment 1: a model of one person's expressions, fitted to unseen ones.
+    """Experiment 1: a model of the expressions of one person, fitted to new expressions.
 
     Args:
         population_z: (N, K) coefficients of the training set in standard deviations.
-        scores: of recognition, by name.
+        scores: recognition scores by name.
     """
 
     folder: str = ""
@@ -359,11 +361,11 @@ class ExpressionsOfOne(DemoModel, frozen=True, kw_only=True):
 
 
 class Case(DemoModel, frozen=True, kw_only=True):
-    """One scan of experiment 2, fitted by a model of other people.
+    """A scan of experiment 2, fitted with a model of other people.
 
     Args:
-        fit: by the method of the paper.
-        robust: by the robust method.
+        fit: fit with the method of the paper.
+        robust: fit with the robust method.
     """
 
     short: str = ""
@@ -374,14 +376,14 @@ class Case(DemoModel, frozen=True, kw_only=True):
 
 
 class ManyPeople(Struct, frozen=True, kw_only=True):
-    """Experiment 2: models of many people, fitted to scans of somebody else."""
+    """Experiment 2: models of many people, fitted to scans of other people."""
 
     folder: str = ""
     cases: tuple[Case, ...] = ()
 
 
 class Claim(Struct, frozen=True, kw_only=True):
-    """What the paper states of a quantity, what the demo measured, the true error, and why they differ."""
+    """A quantity: its value in the paper, its value in the demo, the true error, and the reason for differences."""
 
     quantity: str
     paper: str
@@ -409,7 +411,7 @@ class Demo(Struct, frozen=True, kw_only=True):
 # NAME.correspond.json and correspondence.json
 
 ReviewCode: TypeAlias = Literal["doubtful", "folded", "not_settled", "missing", "unreached", "distance", "area_change"]
-"""Why a surface in correspondence needs review: its status is doubtful; it is far from its scan; triangles are folded;
+"""Reason to review a surface in correspondence: its status is doubtful; it is far from its scan; triangles are folded;
 vertices are missing; parts of the scan are not reached; triangles change their area; the last round moved it."""
 
 
@@ -418,8 +420,8 @@ class ReviewReason(Struct, frozen=True, kw_only=True):
 
     Args:
         code: the measure.
-        value: of the surface: a share from 0 to 1 (`distance` and `not_settled`: of the size of the object), or for
-            `area_change` the factor by which triangles grow or shrink.
+        value: value of the measure: a share from 0 to 1 (`distance` and `not_settled`: of the size of the object), or
+            for `area_change` the factor by which triangles grow or shrink.
         usual: median of all surfaces.
         excess: robust standard deviations by which the value is above the median; reasons are sorted by it.
     """
@@ -448,13 +450,13 @@ class SurfaceReview(Struct, frozen=True, kw_only=True):
         """Count surfaces by the `codes` of their reasons, which are empty for a surface that needs no review."""
         every = [set(own) for own in codes]
         counts: Counter[ReviewCode] = Counter(code for own in every for code in own)
-        return SurfaceReview(surfaces=len(every), needs_review=sum(map(bool, every)), reasons=_in_order(counts))
+        return SurfaceReview(surfaces=len(every), needs_review=sum(map(bool, every)), reasons=_sort_counts(counts))
 
     def __add__(self, other: SurfaceReview) -> SurfaceReview:
         return SurfaceReview(
             surfaces=self.surfaces + other.surfaces,
             needs_review=self.needs_review + other.needs_review,
-            reasons=_in_order(Counter(self.reasons) + Counter(other.reasons)),
+            reasons=_sort_counts(Counter(self.reasons) + Counter(other.reasons)),
         )
 
     @property
@@ -463,42 +465,42 @@ class SurfaceReview(Struct, frozen=True, kw_only=True):
         return 2 * self.needs_review > self.surfaces
 
 
-def _in_order(counts: Mapping[ReviewCode, int]) -> dict[ReviewCode, int]:
+def _sort_counts(counts: Mapping[ReviewCode, int]) -> dict[ReviewCode, int]:
     return {code: counts[code] for code in get_args(ReviewCode) if code in counts}
 
 
 class CorrespondRecord(Struct, frozen=True, kw_only=True):
-    """A NAME.correspond.json: what came of one scan; lengths are in the scan's own unit, shares from 0 to 1.
+    """A NAME.correspond.json: registration result for a scan; lengths are in the unit of the scan, shares from 0 to 1.
 
     Args:
         name: NAME of the result files.
-        path: of the scan, relative to the folder where there is such a path.
-        hash: SHA-256 of its content.
+        path: path of the scan, relative to the folder if possible.
+        hash: SHA-256 of the content of the scan.
         status: `converged`, `doubtful` or `excluded`.
-        reason: why it is excluded.
-        probability: that its surface is right, as far as the other scans show.
-        doubt: why it is doubtful.
+        reason: reason why the scan is excluded.
+        probability: probability that the surface is correct, estimated from the other scans.
+        doubt: reason why the surface is doubtful.
         review: further reasons to review the surface, the most unusual first.
-        seen_share: share of the template's vertices that it shows; the others are estimates.
-        covered_share: share of its points that the template reaches, leaving out those beyond the template's rim.
-        area_share: area of its surface in correspondence beside that of the scan; well below 1 where the template lacks
-            parts that the scan shows.
-        distance_mean, distance_p95, distance_p99, distance_max: both ways, over what is seen and reached.
-        scale: its size beside the usual one, units distinguished.
-        size: RMS distance of the surface from its centroid, by that of the mean shape.
-        unit_ratio: how many times as large as in the unit of most scans its coordinates are, such as 0.001 for metres
-            among millimetres.
-        notes: sentences on what should be known.
-        folded_share: share of the triangles that turn back over their neighbours, as they do not on the mean shape.
-        area_factor: 95 % of the triangles grow or shrink by less than this factor beside those of the mean shape, the
-            change of size divided out.
-        moved_share: RMS by which vertices moved in each round, as a share of its size.
-        cpu_s: of each round.
-        landmark_rms: distance of its landmarks from their places on the surface.
+        seen_share: share of the vertices of the template that the scan shows; the other vertices are estimates.
+        covered_share: share of the points of the scan that the template reaches, without those beyond its rim.
+        area_share: ratio of the area of the surface in correspondence to that of the scan; well below 1 if the template
+            lacks parts that the scan shows.
+        distance_mean, distance_p95, distance_p99, distance_max: overlap distances in both directions.
+        scale: ratio of the size of the scan to the typical size, with a correction for its unit.
+        size: ratio of the RMS distance of the surface from its centroid to that of the mean shape.
+        unit_ratio: factor of the coordinates relative to the unit of most scans, such as 0.001 for metres among
+            millimetres.
+        notes: sentences for the user about the registration.
+        folded_share: share of the triangles that fold over their neighbours, unlike on the mean shape.
+        area_factor: factor of growth or shrinkage relative to the mean shape that 95 % of the triangles do not exceed,
+            without the change of size.
+        moved_share: RMS movement of the vertices in each round, as a share of the size.
+        cpu_s: CPU time of each round, s.
+        landmark_rms: RMS distance of the landmarks of the scan from their positions on the surface.
         landmark_distances: name -> distance of each given landmark from the surface of the scan, in its unit.
         mirrored: whether the scan is a mirror image of the majority. Its surface is in its own frame, with triangles
             whose corners are in reverse order, so that their normals point outwards.
-        metadata: by the columns of the list that named it.
+        metadata: metadata of the scan, by the columns of the list of scans.
     """
 
     CALLED: ClassVar = "a record of correspondence"
@@ -544,32 +546,32 @@ class CorrespondRecord(Struct, frozen=True, kw_only=True):
 
     @property
     def review_codes(self) -> list[ReviewCode]:
-        """Why the surface needs review; empty if it does not."""
+        """Codes of the reasons to review the surface; empty if there are none."""
         codes: list[ReviewCode] = ["doubtful"] if self.doubt else []
         return codes + [reason.code for reason in self.review]
 
 
 class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
-    """A correspondence.json: the run as a whole.
+    """A correspondence.json: result of a run of correspondence.
 
     Args:
-        template: where the first template came from, and why, in a sentence.
-        vertices: of the template.
-        rounds: RMS by which vertices moved in each, as a share of the size.
+        template: sentence on the source of the first template, with the reason.
+        vertices: number of vertices of the template.
+        rounds: RMS movement of the vertices in each round, as a share of the size.
         corresponding: NAMEs in correspondence.
-        set_aside: NAME to reason of the others.
+        set_aside: NAME to reason of the excluded scans.
         doubtful: NAMEs in correspondence whose surfaces are probably wrong.
-        needs_review: NAME to the codes of the reasons (`CorrespondRecord.review_codes`), of those that need review.
-        other_units: NAME to `unit_ratio` of those that are in another unit than most.
-        mirrored: NAMEs of those that are mirror images of the majority.
+        needs_review: NAME to the codes of the reasons (`CorrespondRecord.review_codes`), for surfaces that need review.
+        other_units: NAME to `unit_ratio`, for scans whose unit differs from the majority.
+        mirrored: NAMEs of the scans that are mirror images of the majority.
         sides_decided: whether scans could be distinguished from their mirror images.
-        groups: NAMEs in correspondence, then those of each other kind of object; empty where all are of one kind.
-        settings: of the run.
-        version: of shapespace.
+        groups: NAMEs in correspondence, then those of each other object class; empty if there is only one class.
+        settings: settings of the run.
+        version: version of shapespace.
         inputs_hash: SHA-256 of the scans, landmarks, template, model, settings and version; a run with the same inputs
             reuses the results.
         results_hash: SHA-256 of the files that the run wrote, except this one.
-        added: NAMEs that were registered to the mean after the run, and are not part of it.
+        added: NAMEs of scans that were registered to the mean after the run, and did not affect the mean.
     """
 
     CALLED: ClassVar = "a correspondence"
@@ -599,10 +601,10 @@ class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
 
     @staticmethod
     def from_json(content: object, where: str = "correspondence.json") -> CorrespondenceRecord:
-        """Return what a run says of itself, checked.
+        """Return the checked record of a run.
 
         Raises:
-            FileFormatError: it is no correspondence, of another version, or damaged.
+            FileFormatError: it is not a correspondence, has another version, or is damaged.
         """
         check_format(content, CorrespondenceRecord, where, CORRESPOND_AGAIN)
         return read(CorrespondenceRecord, content, where, CORRESPOND_AGAIN)
@@ -612,7 +614,7 @@ class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
 
 
 class Measured(Struct, frozen=True, kw_only=True):
-    """A measure by the number of modes; without `modes`, of 1, 2, 3 and so on."""
+    """A measure by the number of modes; without `modes`, for 1, 2, 3 and so on."""
 
     mean: tuple[float, ...]
     modes: tuple[float, ...] | None = None
@@ -631,10 +633,10 @@ class BySize(Struct, frozen=True, kw_only=True):
 
 
 class Quality(Struct, frozen=True, kw_only=True):
-    """A quality.json: shares of the variance (0 to 1), and errors in mm, those that were measured.
+    """A quality.json: measured shares of the variance (0 to 1), and measured errors in mm.
 
-    Names without a suffix are measured from surface to surface; `..._vertices` from each vertex to its own place.
-    `others` were measured on the same shapes and folds, and each has what it has more than this in `differences`.
+    Names without a suffix are measured from surface to surface; `..._vertices` between corresponding vertices. `others`
+    were measured on the same shapes and folds; their `differences` are relative to this model.
     """
 
     name: str = ""
@@ -657,7 +659,7 @@ class Quality(Struct, frozen=True, kw_only=True):
 
 
 class Target(Struct, frozen=True, kw_only=True):
-    """What a study aimed at, and what it reached; `met` is None where there is no verdict."""
+    """A target of a study and the result; `met` is None if the target was not assessed."""
 
     what: str = ""
     target: str = ""
@@ -667,7 +669,7 @@ class Target(Struct, frozen=True, kw_only=True):
 
 
 class Part(Struct, frozen=True, kw_only=True, omit_defaults=True, tag_field="kind"):
-    """What each part of a study has; its class is its `kind` in JSON. One of `level` 2 begins a chapter."""
+    """Common fields of the parts of a study; the class is `kind` in JSON. A part of `level` 2 begins a chapter."""
 
     title: str | None = ""
     note: str | None = ""
@@ -681,14 +683,14 @@ class TextPart(Part, frozen=True, kw_only=True, tag="text"):
 
 
 class TableColumn(Struct, frozen=True):
-    """A column of a table; shares are 0 to 1, an interval is two of them."""
+    """A column of a table; shares are 0 to 1, an interval consists of two shares."""
 
     name: str = ""
     kind: Literal["text", "percent", "interval", "number", "mm", "p", "count"] = "text"
 
 
 class TablePart(Part, frozen=True, kw_only=True, tag="table"):
-    """A table, its cells by the kinds of their columns; null where nothing is known."""
+    """A table; the cells depend on the kinds of their columns, and are None if unknown."""
 
     columns: tuple[TableColumn, ...]
     rows: tuple[tuple[Any, ...], ...]
@@ -701,32 +703,32 @@ class TablePart(Part, frozen=True, kw_only=True, tag="table"):
         """Return a table; the kind of a column is that of its first cell that is not None.
 
         Args:
-            title: of the table.
-            columns: their names; `p` is the one of p values.
-            rows: of texts, integers, numbers and intervals.
-            percent: columns of shares.
-            note: of the table.
-            level: of the title.
+            title: title of the table.
+            columns: names of the columns; `p` is the column of p values.
+            rows: rows of texts, integers, numbers and intervals.
+            percent: names of the columns of shares.
+            note: note below the table.
+            level: heading level of the title.
         """
         kinds: dict[str, Any] = {"p": "p", **dict.fromkeys(percent, "percent")}
         types: tuple[tuple[type, Any], ...] = ((str, "text"), (int, "count"), (tuple, "interval"), (object, "number"))
         made: list[TableColumn] = []
         for k, name in enumerate(columns):
             cell = next((row[k] for row in rows if row[k] is not None), 0.0)
-            kind: Any = kinds.get(name) or next(one for own, one in types if isinstance(cell, own))
+            kind: Any = kinds.get(name) or next(label for own, label in types if isinstance(cell, own))
             made.append(TableColumn(name=name, kind=kind))
         return TablePart(title=title, columns=tuple(made), rows=tuple(rows), note=note, level=level)
 
 
 class ConfusionPart(Part, frozen=True, kw_only=True, tag="confusion"):
-    """How many scans of each true class (rows) were taken for each class (columns)."""
+    """Number of scans of each true class (rows) that were assigned to each class (columns)."""
 
     classes: tuple[str, ...]
     counts: tuple[tuple[float, ...], ...]
 
 
 class Bin(Struct, frozen=True, kw_only=True):
-    """Answers that state a probability from `low` to `high`: the mean of it, the share that is right, how many."""
+    """Predictions with a probability from `low` to `high`: mean probability, share of correct ones, and count."""
 
     low: float
     high: float
@@ -736,7 +738,7 @@ class Bin(Struct, frozen=True, kw_only=True):
 
 
 class CalibrationPart(Part, frozen=True, kw_only=True, tag="calibration"):
-    """How often answers are right against the probability stated."""
+    """Share of correct predictions against the predicted probability."""
 
     bins: tuple[Bin, ...]
     ece: float | None = None
@@ -744,7 +746,7 @@ class CalibrationPart(Part, frozen=True, kw_only=True, tag="calibration"):
 
 
 class LearningCurvePart(Part, frozen=True, kw_only=True, tag="learning_curve"):
-    """Accuracy against the number of people learned from; `band` says what `low` and `high` are."""
+    """Accuracy against the number of training subjects; `band` describes `low` and `high`."""
 
     subjects: tuple[float, ...]
     mean: tuple[float, ...]
@@ -755,7 +757,7 @@ class LearningCurvePart(Part, frozen=True, kw_only=True, tag="learning_curve"):
 
 
 class Series(Struct, frozen=True, kw_only=True):
-    """One line of a curve, with a band around it where there is one; `points` are dots without a line.
+    """One line of a curve, optionally with a band; `points` are dots without a line.
 
     Series with the same `group`, a number from 0, have the same colour and marker.
     """
@@ -770,9 +772,9 @@ class Series(Struct, frozen=True, kw_only=True):
 
 
 class CurvePart(Part, frozen=True, kw_only=True, tag="curve"):
-    """One measure against another; `x` and `y` say what they are.
+    """A curve of one measure against another; `x` and `y` are their names.
 
-    On a `probit` scale shares stand at their normal deviates, as in a DET curve; `diagonal` draws y = x.
+    On a `probit` scale shares are plotted at their normal deviates, as in a DET curve; `diagonal` draws y = x.
     """
 
     series: tuple[Series, ...]
@@ -784,17 +786,17 @@ class CurvePart(Part, frozen=True, kw_only=True, tag="curve"):
 
 
 class SurfaceMapPart(Part, frozen=True, kw_only=True, tag="surface_map"):
-    """A surface in an .npz file with a number a vertex, seen from several sides.
+    """A surface in an .npz file with a value per vertex, drawn in several views.
 
     Args:
-        arrays: the file; the next three are names of arrays in it.
-        vertices: (V, 3) mm.
-        faces: (F, 3); empty where the surface has none.
-        values: (V,); NaN where there is none.
+        arrays: path of the file.
+        vertices: name of the array (V, 3) of positions, mm.
+        faces: name of the array (F, 3) of triangles; empty without triangles.
+        values: name of the array (V,) of values; NaN for missing values.
         mask: name of a (V,) boolean array, outside which the colour is pale; empty for none.
-        unit: of the numbers.
-        signed: whether two colours part at zero.
-        limit: where the colours end, in `unit`; None for what 98 % of the numbers stay below.
+        unit: unit of the values.
+        signed: whether the colour map is diverging, with its centre at zero.
+        limit: upper limit of the colour map, in `unit`; None for the 98 % quantile of the values.
     """
 
     arrays: str
@@ -811,12 +813,12 @@ class ShapeChangePart(Part, frozen=True, kw_only=True):
     """Two shapes in correspondence in an .npz file, such as both ends of a change.
 
     Args:
-        arrays: the file; the next two are names of arrays in it.
-        low: (V, 3) mm.
-        high: (V, 3) mm.
-        low_label: what `low` is.
-        high_label: what `high` is.
-        times: factor of the difference in both; 1 is the true difference, below 1 it is drawn smaller.
+        arrays: path of the file.
+        low: name of the array (V, 3) of the first shape, mm.
+        high: name of the array (V, 3) of the second shape, mm.
+        low_label: description of `low`.
+        high_label: description of `high`.
+        times: factor of the difference between the shapes: 1 for the true difference, below 1 for a reduced one.
     """
 
     arrays: str
@@ -828,7 +830,7 @@ class ShapeChangePart(Part, frozen=True, kw_only=True):
 
 
 class MorphPart(ShapeChangePart, frozen=True, kw_only=True, tag="morph"):
-    """Two surfaces, between which a slider moves.
+    """Two surfaces with a slider between the shapes.
 
     The slider moves on a line, or through the shapes low + weights[k] modes, at equal steps of a variable.
 
@@ -837,7 +839,7 @@ class MorphPart(ShapeChangePart, frozen=True, kw_only=True, tag="morph"):
         modes: name of an array (q, V, 3), mm; empty for a line.
         weights: name of an array (B, q), 0 in the first row.
         variable: name of the variable.
-        range: its values at `low` and `high`.
+        range: values of the variable at `low` and `high`.
     """
 
     faces: str = "faces"
@@ -848,29 +850,29 @@ class MorphPart(ShapeChangePart, frozen=True, kw_only=True, tag="morph"):
 
 
 class DeformationPart(ShapeChangePart, frozen=True, kw_only=True, tag="deformation"):
-    """Two configurations of landmarks: a deformation grid, or a vector for each landmark; z is 0 for planar ones.
+    """Two configurations of landmarks: a deformation grid, or a vector for each landmark; z is 0 for planar landmarks.
 
     Args:
-        drawing: `grid` for a thin-plate spline of planar landmarks, `vectors` for any.
+        drawing: `grid` for a thin-plate spline of planar landmarks, `vectors` for any landmarks.
     """
 
     drawing: Literal["grid", "vectors"] = "vectors"
 
 
 class MorphospacePart(Part, frozen=True, kw_only=True, tag="morphospace"):
-    """Shapes as points in the plane of two axes of an ordination; a click draws the shape there next to the mean.
+    """Shapes as points in the plane of two axes of an ordination; a click draws the shape at a point next to the mean.
 
     Args:
         arrays: an .npz file with `scores` (N, A), `mean` (V, 3), `shape_axes` (A, V, 3), the change of shape per unit
             of score, and `faces` (F, 3), empty for landmarks; perhaps with `groups` (N,) codes, `cross_validated`
             (N, A) scores, and `nodes` (M, A) and `edges` (E, 2) of a phylogeny, whose tips are the shapes.
-        names: of the N shapes.
-        axes: names of the A axes.
+        names: N names of the shapes.
+        axes: A names of the axes.
         shares: (A,) share of the variance of each axis.
         first: numbers of the axes drawn across and up, from 0.
         groups: names of the groups.
-        variable: whose classes they are.
-        unit: of the scores; empty for none.
+        variable: name of the variable with these groups.
+        unit: unit of the scores; empty for none.
     """
 
     arrays: str
@@ -884,14 +886,14 @@ class MorphospacePart(Part, frozen=True, kw_only=True, tag="morphospace"):
 
 
 class Counts(Struct, frozen=True, kw_only=True):
-    """How many values fall between each pair of `edges` of a histogram."""
+    """Number of values in each bin between the `edges` of a histogram."""
 
     counts: tuple[float, ...]
     label: str = ""
 
 
 class HistogramPart(Part, frozen=True, kw_only=True, tag="histogram"):
-    """How values are spread; `observed` is a line at one of them, such as a statistic among its permutations."""
+    """A histogram; `observed` is a value marked by a line, such as a statistic among its permutations."""
 
     edges: tuple[float, ...]
     series: tuple[Counts, ...]
@@ -906,20 +908,20 @@ _PARTS = (
     | HistogramPart | MorphospacePart | DeformationPart
 )  # fmt: skip
 PARTS: Mapping[str, type[Part]] = {str(kind.__struct_config__.tag): kind for kind in get_args(_PARTS)}
-"""What a part is, by its kind."""
+"""Class of a part by its kind."""
 
 
 def read_part(content: object, where: str, again: str = STUDY_AGAIN) -> Part:
     """Return one part of a study by its kind.
 
     Raises:
-        FileFormatError: it is damaged, or of a kind that this version does not know.
+        FileFormatError: it is damaged, or this version does not support its kind.
     """
     return read(cast(type[Part], _PARTS), content, where, again)
 
 
 class Recognition(Struct, frozen=True, kw_only=True):
-    """A recognition.json; `parts` are read one by one with `read_part`, so that one that is damaged costs no other."""
+    """A recognition.json; each part is read with `read_part`, so that a damaged part does not affect the others."""
 
     CALLED: ClassVar = "the result of a study of recognition"
     FORMAT: ClassVar = "shapespace recognition"
@@ -939,10 +941,10 @@ class Recognition(Struct, frozen=True, kw_only=True):
 
     @classmethod
     def from_json(cls, content: object, where: str = "recognition.json", again: str = STUDY_AGAIN) -> Self:
-        """Return a study, with all of its parts checked.
+        """Return a study with checked parts.
 
         Raises:
-            FileFormatError: it is no study of recognition, of another version, or damaged.
+            FileFormatError: it is not a study of recognition, has another version, or is damaged.
         """
         check_format(content, cls, where, again)
         study = read(cls, content, where, again)
@@ -964,23 +966,23 @@ class SampleSize(Struct, frozen=True, kw_only=True):
 
 
 class TestScheme(Struct, frozen=True, kw_only=True):
-    """How the p values of one or more terms were computed.
+    """Method of the p values of one or more terms.
 
     Args:
-        tested: terms, or other quantities.
-        stratum: in which they are tested; empty where there is one.
-        statistic: such as `F`, `Welch t` or `R2`; empty for p values of a distribution.
-        resampling: permutations of rows, sign flips of rows, bootstrap draws, leaving out each unit, or none.
-        unit: what is permuted or flipped, such as `subject`; `scan of a subject`: values are permuted within subjects,
-            and between subjects with the same number of scans.
+        tested: names of the terms, or of other quantities.
+        stratum: stratum of the tests; empty if there is only one.
+        statistic: name of the statistic, such as `F`, `Welch t` or `R2`; empty for p values of a distribution.
+        resampling: method: permutations of rows, sign flips of rows, bootstrap draws, leave-one-out, or none.
+        unit: unit that is permuted or flipped, such as `subject`; `scan of a subject`: values are permuted within
+            subjects, and between subjects with the same number of scans.
         reduced_model: terms of the model whose residuals are resampled; empty for the mean; None where values
             themselves are.
-        arrangements: number of them, the observed data among them.
-        exhaustive: whether these are all there are.
+        arrangements: number of resamples, including the observed data.
+        exhaustive: whether these are all possible resamples.
         unequal_variances: whether the test allows groups of unequal dispersion.
     """
 
-    __test__: ClassVar = False  # no test class of pytest
+    __test__: ClassVar = False  # not a test class of pytest
 
     tested: tuple[str, ...]
     statistic: str = "F"
@@ -997,16 +999,16 @@ class Dispersion(Struct, frozen=True, kw_only=True):
     """A test of equal dispersion of groups.
 
     Args:
-        variable: whose classes are the groups.
-        stratum: in which residuals are taken; empty where there is one.
-        groups: classes with two or more members.
-        counts: members of each.
-        stddev: standard deviation of each about its mean, RMS over the vertices, in `Methods.unit`.
+        variable: name of the variable whose classes are the groups.
+        stratum: stratum of the residuals; empty if there is only one.
+        groups: names of the classes with two or more members.
+        counts: number of members of each group.
+        stddev: standard deviation of each group about its mean, RMS over the vertices, in `Methods.unit`.
         f: F of the distances to the group mean.
-        p: by permutation of these distances.
-        arrangements: number of permutations, the observed data among them.
+        p: p value from permutations of these distances.
+        arrangements: number of permutations, including the observed data.
         equal: whether p is above the level of significance.
-        smaller_is_more_variable: whether smaller groups have the larger dispersion; None where neither is so.
+        smaller_is_more_variable: whether smaller groups have the larger dispersion; None without such a trend.
     """
 
     variable: str
@@ -1028,22 +1030,22 @@ class Methods(Struct, frozen=True, kw_only=True):
         subjects: number of subjects.
         shapes: number of shapes.
         vertices: number of vertices, or landmarks, of a shape.
-        coordinates: of a vertex: 2 or 3.
-        gauge: `shape` divides size out, `form` keeps it.
-        tangent: whether the shapes lie in the tangent space at their mean.
-        source: of the shapes: coefficients, fitted, dense, corresponding, other surfaces, or landmarks.
-        review: number of the surfaces in correspondence that need review.
-        modes: of the model that the shapes are combinations of; None where they are not limited to modes.
-        explained_variance_ratio: share of the model's training variance in these modes; None as for `modes`.
-        dimensions: of the space that is analysed; None where maps of vertices are.
+        coordinates: number of coordinates of a vertex, 2 or 3.
+        gauge: size handling: `shape` (size divided out) or `form` (size kept).
+        tangent: whether the shapes are in the tangent space at their mean.
+        source: source of the shapes: coefficients, fitted, dense, corresponding, other surfaces, or landmarks.
+        review: number of surfaces in correspondence that need review.
+        modes: number of modes of the model that represents the shapes; None if shapes are not limited to modes.
+        explained_variance_ratio: share of the training variance of the model in these modes; None as for `modes`.
+        dimensions: dimension of the analysed space; None for the analysis of vertex maps.
         analysed_variance_ratio: share of the variance of the cohort in these dimensions.
-        unit: of lengths: `mm`, or empty for coordinates without a unit.
-        level: of significance.
-        sizes: subjects and shapes of each class, and of each combination of classes.
-        tests: how p values were computed.
+        unit: unit of lengths: `mm`, or empty for coordinates without a unit.
+        level: level of significance.
+        sizes: numbers of subjects and shapes of each class, and of each combination of classes.
+        tests: methods of the p values.
         dispersions: tests of equal dispersion.
-        unequal_variances: whether tests allow unequal dispersion; None where no groups are compared.
-        effect_size: transformation before Z is standardised, `box-cox` or `log`; empty where no Z is given.
+        unequal_variances: whether tests allow unequal dispersion; None if no groups are compared.
+        effect_size: transformation before Z is standardised, `box-cox` or `log`; empty without Z.
         r2_strata: strata whose total sums of squares are the reference of R²; an empty name means all shapes. None
             without R².
         corrected_over: sets over which p values are corrected for multiple testing; there is no other correction.
@@ -1078,9 +1080,9 @@ class NamedView(Struct, frozen=True, kw_only=True):
     """A view of an object, in the frame of its mean shape.
 
     Args:
-        name: such as `dorsal`.
+        name: name of the view, such as `dorsal`.
         toward_viewer: direction from the object to the viewer.
-        up: direction that points up in the figure.
+        up: direction that is up in the figure.
     """
 
     name: str
@@ -1089,11 +1091,11 @@ class NamedView(Struct, frozen=True, kw_only=True):
 
 
 class Orientation(Struct, frozen=True, kw_only=True):
-    """An orientation.json: how the figures of an object are drawn.
+    """An orientation.json: settings of the figures of an object.
 
     Args:
-        views: named views in the order of the figures; empty for views that are chosen by the form of the object.
-        links: pairs of landmarks, numbers from 1, between which figures have a line.
+        views: named views in the order of the figures; empty for views that depend on the shape of the object.
+        links: pairs of landmarks, numbered from 1, that are connected by lines in figures.
     """
 
     FILE: ClassVar = "orientation.json"
@@ -1115,20 +1117,20 @@ class AlignRecord(Struct, frozen=True, kw_only=True):
     """An align.json: the alignment of landmarks whose coordinates are in aligned.csv next to it.
 
     Args:
-        source: the landmark file or folder.
-        specimens: their number.
-        landmarks: their number.
-        dimensions: 2 or 3.
-        unit: of centroid sizes: `mm`, or empty.
+        source: path of the landmark file or folder.
+        specimens: number of specimens.
+        landmarks: number of landmarks.
+        dimensions: dimension of the space, 2 or 3.
+        unit: unit of centroid sizes: `mm`, or empty if unknown.
         gauge: `shape` (unit centroid size) or `form`.
         tangent: whether shapes are projected onto the tangent space at their mean, as one structure.
-        settings: further options, and the numbers of semilandmarks.
+        settings: further options, and numbers of semilandmarks.
         estimated: number of landmarks that are estimates.
-        iterations: of generalised Procrustes analysis.
-        converged: whether its criterion was met.
+        iterations: number of iterations of generalised Procrustes analysis.
+        converged: whether the convergence criterion was met.
         findings: specimens to check.
-        notes: a sentence each.
-        version: of shapespace.
+        notes: sentences about the data and the alignment.
+        version: version of shapespace.
     """
 
     source: str = ""
@@ -1148,7 +1150,7 @@ class AlignRecord(Struct, frozen=True, kw_only=True):
 
 
 class Analysis(Recognition, frozen=True, kw_only=True):
-    """An analysis.json: an answer about a cohort, by the command in `question`, as parts like those of a study."""
+    """An analysis.json: result for a cohort by the command in `question`, in parts like those of a study."""
 
     CALLED: ClassVar = "the result of an analysis"
     FORMAT: ClassVar = "shapespace analysis"
@@ -1164,5 +1166,5 @@ class Analysis(Recognition, frozen=True, kw_only=True):
 
     @classmethod
     def from_json(cls, content: object, where: str = "analysis.json", again: str = ANALYSIS_AGAIN) -> Self:
-        """Return an analysis, with all of its parts checked; errors as of a study."""
+        """Return an analysis with checked parts; see `Recognition.from_json` for errors."""
         return super().from_json(content, where, again)

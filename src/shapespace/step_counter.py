@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 Progress: TypeAlias = Callable[[int, int], None]
-"""Called with (steps done, in all)."""
+"""Function that is called with (completed steps, total steps)."""
 
 
 @dataclass
@@ -15,9 +15,9 @@ class StepCounter:
     """Counts the steps of a computation and reports them.
 
     Args:
-        total: number of steps in all.
-        progress: called with (steps done, in all); None for nothing.
-        done: number of steps done.
+        total: total number of steps.
+        progress: function that is called with (completed steps, total steps), or None.
+        done: number of completed steps.
     """
 
     total: int
@@ -25,7 +25,7 @@ class StepCounter:
     done: int = 0
 
     def add(self, count: int = 1) -> None:
-        """Count steps that are done."""
+        """Add completed steps."""
         self.done += count
         if self.progress is not None:
             self.progress(self.done, self.total)

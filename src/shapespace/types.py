@@ -1,7 +1,7 @@
 """Data types that all parts share: meshes, landmarks, similarities and label volumes.
 
-Arrays are float64 and read-only. Lengths are millimetres, except the vertices of a scan as read from its file,
-which are in the file's own unit until the fit has found that unit.
+Arrays are float64 and read-only. Lengths are millimetres, except the vertices of a scan as read from its file, which
+are in the unit of the file until the fit has determined that unit.
 """
 
 from __future__ import annotations
@@ -29,65 +29,65 @@ ByteArray: TypeAlias = npt.NDArray[np.uint8]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 
 MM_PER_UNIT: Mapping[str, float] = MappingProxyType({"um": 1e-3, "mm": 1.0, "cm": 10.0, "inch": 25.4, "m": 1000.0})
-"""Millimetres in one of each unit a scan may come in."""
+"""Length of each supported unit of scans, mm."""
 
 RAS_TO_LPS = np.array([-1.0, -1.0, 1.0])
-"""Signs that take points (..., 3) from right, anterior, superior to left, posterior, superior, and back."""
+"""Signs that convert points (..., 3) from right, anterior, superior to left, posterior, superior, and back."""
 
 GREY = 128
-"""Red, green and blue of vertices without a colour, where others of their surface have one."""
+"""Red, green and blue of vertices without a colour, if other vertices of the surface have colours."""
 
 
 _MOST_VERTICES = int(np.iinfo(np.int32).max)
 _FEW_DIGITS, _ROUNDING = 1e-4, 1e-12
-"""By which the sum of barycentric coordinates may differ from 1: as written with few digits, and by rounding."""
+"""Tolerated differences of the sum of barycentric coordinates from 1: for text with few digits, and for rounding."""
 
 
 def require(value: object, expected: type, function: str, remedy: str) -> None:
     """Raise an InputError if an argument has the wrong type.
 
     Args:
-        value: the argument.
-        expected: its type.
-        function: name of the function that takes it.
-        remedy: the caller gets one, as the end of the sentence.
+        value: argument to check.
+        expected: expected type of the argument.
+        function: name of the function that received the argument.
+        remedy: advice for the caller, as the end of the message.
 
     Raises:
-        InputError: it is of another type.
+        InputError: the argument has another type.
     """
     if not isinstance(value, expected):
         raise InputError(f"{function} takes a {expected.__name__}, not {type(value).__name__}; {remedy}.")
 
 
 def require_path(value: object, function: str) -> None:
-    """Refuse an argument that is no path in a sentence.
+    """Raise an InputError if an argument is not a path.
 
     Raises:
-        InputError: it is neither text nor a path.
+        InputError: the argument is neither text nor a path.
     """
     if not isinstance(value, str | PathLike):
         raise InputError(f"{function} takes a path, not {type(value).__name__}; give a str or a Path.")
 
 
 def require_whole(value: object, name: str) -> None:
-    """Refuse a setting that is neither a whole number nor None in a sentence.
+    """Raise an InputError if a setting is neither an integer nor None.
 
     Raises:
-        InputError: it is neither.
+        InputError: the setting has another type.
     """
     if value is not None and not isinstance(value, Integral):
-        raise InputError(f"{name} is a whole number or None, not {type(value).__name__}; give a number such as 10.")
+        raise InputError(f"{name} is an integer or None, not {type(value).__name__}; give a number such as 10.")
 
 
 def generator_of(rng: object, function: str) -> np.random.Generator:
-    """Return a generator from itself or a seed.
+    """Return a random generator, created from a seed if needed.
 
     Args:
-        rng: `np.random.Generator`, or a whole number from 0.
-        function: that takes it, for the message.
+        rng: `np.random.Generator`, or a non-negative integer as its seed.
+        function: name of the function that received `rng`, used in the message.
 
     Raises:
-        InputError: it is neither.
+        InputError: `rng` is neither.
     """
     if isinstance(rng, np.random.Generator):
         return rng
@@ -97,10 +97,10 @@ def generator_of(rng: object, function: str) -> np.random.Generator:
 
 
 def read_only(array: npt.ArrayLike) -> FloatArray:
-    """Return `array` as a C-ordered float64 array that refuses writing; a view where no copy is needed.
+    """Return `array` as a read-only C-ordered float64 array; a view if no copy is needed.
 
     Args:
-        array: anything numpy can turn into float64, any shape.
+        array: array or sequence that numpy can convert to float64, of any shape.
     """
     out = np.ascontiguousarray(array, dtype=np.float64).view()
     out.setflags(write=False)
@@ -108,26 +108,26 @@ def read_only(array: npt.ArrayLike) -> FloatArray:
 
 
 def set_fields(instance: object, **fields: object) -> None:
-    """Set fields of a frozen instance while it is made: those that `__post_init__` converts."""
+    """Set fields of a frozen instance during its creation, such as those that `__post_init__` converts."""
     for name, value in fields.items():
         object.__setattr__(instance, name, value)
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """A surface, or a point cloud when it has no faces.
+    """A surface, or a point cloud if it has no faces.
 
     Args:
-        vertices: (V, 3) float64, in the order of the file; V may be 0 only while a file is being examined.
+        vertices: (V, 3) float64 positions, in the order of the file; V may be 0 only during the examination of a file.
         faces: (F, 3) int32 indices into `vertices`, counter-clockwise seen from outside; None for a point cloud.
-        landmarks: name -> (3,) float64, in the same frame and unit as `vertices`.
-        name: where it came from, used in messages and result files.
-        colours: (V, 3) uint8 red, green and blue of each vertex, as screens show them (sRGB); None where not known.
-        notes: what was left out as it was read, a sentence each.
+        landmarks: name -> (3,) float64 position, in the same frame and unit as `vertices`.
+        name: name of the source, used in messages and result files.
+        colours: (V, 3) uint8 red, green and blue (sRGB) of each vertex; None if unknown.
+        notes: sentences about data of the file that were omitted or changed.
         observed: (V,) bool, False for vertices whose positions are estimates because the scan does not show them;
             None if all are observed.
-        position_std: (V,) standard deviation of each vertex's position in any direction along the surface, in the unit
-            of `vertices`; None where not known.
+        position_std: (V,) standard deviation of the position of each vertex in any direction along the surface, in the
+            unit of `vertices`; None if unknown.
 
     Raises:
         MeshError: arrays of the wrong shape, or faces that index past the end of the vertices.
@@ -156,7 +156,7 @@ class Mesh:
             if raw.ndim != 2 or raw.shape[1] != 3:
                 raise MeshError(f"{self.name}: faces must have the shape (F, 3), not {raw.shape}.")
             if raw.dtype.kind == "f" and (raw % 1 != 0).any():
-                raise MeshError(f"{self.name}: faces must be whole numbers, the indices of vertices.")
+                raise MeshError(f"{self.name}: faces must be integers, the indices of vertices.")
             if raw.size and (raw.min() < 0 or raw.max() >= len(vertices)):
                 bad = int(raw.max()) if raw.max() >= len(vertices) else int(raw.min())
                 raise MeshError(
@@ -192,7 +192,7 @@ class Mesh:
             object.__setattr__(self, "position_std", std)
 
     def __getstate__(self) -> dict[str, Any]:
-        # For copies, other processes and skops, none of which takes read-only mappings.
+        # For copies, other processes and skops, which do not support read-only mappings.
         fields = {item.name: getattr(self, item.name) for item in dataclasses.fields(self)}
         return {**fields, "landmarks": dict(self.landmarks)}
 
@@ -200,7 +200,7 @@ class Mesh:
         self.__init__(**state)  # type: ignore[misc]
 
     def with_vertices(self, vertices: npt.ArrayLike, landmarks: Mapping[str, FloatArray] | None = None) -> Mesh:
-        """Return the mesh with other `vertices` (V, 3), without `position_std`, and landmarks only where given."""
+        """Return the mesh with other `vertices` (V, 3), without `position_std`, and only with the given landmarks."""
         positions = np.asarray(vertices, dtype=np.float64)
         return Mesh(
             vertices=positions,
@@ -214,7 +214,7 @@ class Mesh:
 
     @property
     def bounds(self) -> FloatArray:
-        """(2, 3) least and largest coordinates of the vertices, in their unit."""
+        """(2, 3) smallest and largest coordinates of the vertices, in their unit."""
         return read_only([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
     @property
@@ -229,16 +229,16 @@ class Mesh:
         """Write the mesh to a file, in the format of its ending; see `write_mesh`.
 
         Raises:
-            FileFormatError: the ending is no format that is written.
+            FileFormatError: the ending is not that of a format that can be written.
             FileError: the file cannot be written.
         """
         require_path(path, "Mesh.export")
         lazy_import("write_mesh")(path, self)
 
     def to_trimesh(self) -> Any:
-        """Return a `trimesh.Trimesh` with the same vertices, or a `trimesh.PointCloud` where there are no triangles.
+        """Return a `trimesh.Trimesh` with the same vertices, or a `trimesh.PointCloud` for a point cloud.
 
-        Landmarks are left out, here as in the next four; `as_mesh` leads back.
+        Landmarks are omitted in this and the following four conversions; `as_mesh` is the inverse.
 
         Raises:
             ShapespaceError: trimesh is not installed.
@@ -254,7 +254,7 @@ class Mesh:
         return lazy_import("to_pyvista")(self)
 
     def to_open3d(self) -> Any:
-        """Return an `open3d.geometry.TriangleMesh`, or a `PointCloud` where there are no triangles.
+        """Return an `open3d.geometry.TriangleMesh`, or a `PointCloud` for a point cloud.
 
         Raises:
             ShapespaceError: Open3D is not installed.
@@ -262,7 +262,7 @@ class Mesh:
         return lazy_import("to_open3d")(self)
 
     def to_meshio(self) -> Any:
-        """Return a `meshio.Mesh` of triangles, or of vertices where there are none.
+        """Return a `meshio.Mesh` of triangles, or of vertices for a point cloud.
 
         Raises:
             ShapespaceError: meshio is not installed.
@@ -270,7 +270,7 @@ class Mesh:
         return lazy_import("to_meshio")(self)
 
     def to_menpo(self) -> Any:
-        """Return a `menpo.shape.TriMesh`, or a `PointCloud` where there are no triangles.
+        """Return a `menpo.shape.TriMesh`, or a `PointCloud` for a point cloud.
 
         Raises:
             ShapespaceError: menpo is not installed.
@@ -290,15 +290,14 @@ class SurfaceLandmarks(Mapping[str, int]):
     mapping, it is name -> nearest vertex (the corner with the largest barycentric coordinate).
 
     Args:
-        names: of the L landmarks, all different.
-        corners: (L, 3) int32, the vertices of the triangle of each; they are put in order of falling coordinates. A
+        names: L names of the landmarks, all different.
+        corners: (L, 3) int32 vertices of the triangle of each landmark; they are sorted by decreasing coordinates. A
             landmark at a vertex has that vertex three times.
-        barycentric: (L, 3) float64 coordinates in that triangle: not negative, with the sum 1.
-        distance_mm: (L,) float64, distance of the given point from the surface; 0 for one given on it. Empty
-            for 0 of all.
+        barycentric: (L, 3) float64 barycentric coordinates in that triangle: not negative, with the sum 1.
+        distance_mm: (L,) float64 distance of each given point from the surface, mm; empty if all distances are 0.
 
     Raises:
-        InputError: arrays whose shapes do not belong together, repeated names, or coordinates that are not barycentric.
+        InputError: arrays with inconsistent shapes, repeated names, or coordinates that are not barycentric.
 
     Example:
         >>> marks = ss.geometry.SurfaceLandmarks.of({"tip": 7})
@@ -327,7 +326,7 @@ class SurfaceLandmarks(Mapping[str, int]):
         total = weights.sum(axis=1, keepdims=True) if within else np.zeros((count, 1))
         if not (within and (np.abs(total - 1.0) <= _FEW_DIGITS).all()):
             raise InputError("Barycentric coordinates of landmarks must not be negative, with the sum 1.")
-        # What differs by rounding alone stays as it is, so that it is the same again once it was written and read.
+        # Coordinates whose sum differs from 1 only by rounding are unchanged, so that writing and reading is exact.
         weights = np.where(np.abs(total - 1.0) > _ROUNDING, weights / total, weights)
         if not (np.isfinite(distance).all() and (distance >= 0).all()):
             raise InputError("Distances of landmarks from the surface must be finite and not negative.")
@@ -338,7 +337,7 @@ class SurfaceLandmarks(Mapping[str, int]):
                 raise InputError(
                     f"Landmark {name!r} is at vertex {low if low < 0 else high}, which the model does not have."
                 )
-        # A corner without weight may be missing from the surface, and must not matter.
+        # A corner with the weight 0 may be missing from the surface, and must have no effect.
         corners = np.where(weights > 0, corners, corners[:, :1]).astype(np.int32)
         for array in (corners, weights, distance):
             array.setflags(write=False)
@@ -350,7 +349,7 @@ class SurfaceLandmarks(Mapping[str, int]):
     __repr__ = short_repr
 
     def __getstate__(self) -> dict[str, Any]:
-        # Plain values, as of `Mesh`.
+        # Plain values, like `Mesh`.
         return {item.name: getattr(self, item.name) for item in dataclasses.fields(self)} | {"names": list(self.names)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -390,14 +389,14 @@ class SurfaceLandmarks(Mapping[str, int]):
 
     @property
     def are_vertices(self) -> bool:
-        """Whether each landmark was given as a vertex: exactly at a vertex, at no distance from the surface."""
+        """Whether each landmark was given as a vertex: exactly at a vertex, with the distance 0 from the surface."""
         return bool((self.barycentric[:, 0] == 1.0).all()) and not self.distance_mm.any()
 
     def interpolate(self, values: npt.ArrayLike) -> FloatArray:
         """Return values of the vertices at the landmarks.
 
         Args:
-            values: (V, ...) of the vertices, such as their positions (V, 3).
+            values: (V, ...) values of the vertices, such as their positions (V, 3).
 
         Returns:
             (L, ...) float64.
@@ -418,7 +417,7 @@ class SurfaceLandmarks(Mapping[str, int]):
         """Return these landmarks followed by `others`, which have different names.
 
         Raises:
-            InputError: a name is in two of them.
+            InputError: a name occurs more than once.
         """
         parts = (self, *others)
         return SurfaceLandmarks(
@@ -441,10 +440,10 @@ class SurfaceLandmarks(Mapping[str, int]):
         return dataclasses.replace(remaining, corners=number[remaining.corners].astype(np.int32))
 
     def check(self, n_vertices: int) -> None:
-        """Refuse landmarks on vertices that a surface of `n_vertices` does not have.
+        """Check that a surface with `n_vertices` vertices has all vertices of the landmarks.
 
         Raises:
-            InputError: it does not have one of their vertices.
+            InputError: the surface does not have a vertex of a landmark.
         """
         for name, corner in zip(self.names, self.corners.max(axis=1), strict=True):
             if corner >= n_vertices:
@@ -462,7 +461,7 @@ class Similarity:
     Args:
         scale: positive number.
         rotation: (3, 3) float64, orthonormal, determinant +1.
-        translation: (3,) float64, in the target's unit.
+        translation: (3,) float64, in the unit of the target.
 
     Raises:
         InputError: a scale that is not positive, or a matrix that is not a rotation.
@@ -490,7 +489,7 @@ class Similarity:
             raise InputError(f"The scale of a similarity must be positive and finite, not {self.scale!r}.")
         if not all(isfinite(t) for t in translation.tolist()):
             raise InputError("The translation of a similarity must be finite.")
-        (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()  # plain numbers: a fit makes 40 of these
+        (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()  # plain numbers for speed: 40 per fit
         determinant = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
         if not (np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-5 and determinant > 0):
             raise InputError("The rotation of a similarity must be orthonormal with determinant +1.")
@@ -500,7 +499,7 @@ class Similarity:
 
     @staticmethod
     def identity() -> Similarity:
-        """Return the similarity that moves nothing."""
+        """Return the identity transform."""
         return Similarity(1.0, np.eye(3), np.zeros(3))
 
     def apply(self, points: npt.ArrayLike) -> FloatArray:
@@ -520,7 +519,7 @@ class Similarity:
 
 
 MAX_MEMORY_BYTES = 2**32
-"""Memory that a label volume and its surface may take by default (4 GiB): a CT of the trunk with one organ takes 2."""
+"""Default memory limit of a label volume and its surface (4 GiB); a CT of the trunk with one organ takes 2 GiB."""
 
 
 @dataclass(frozen=True)
@@ -528,10 +527,10 @@ class Segment:
     """A segment of 3D Slicer: the voxels of one layer that have its label.
 
     Args:
-        name: shown in 3D Slicer.
-        label: in its layer.
-        layer: index of the layer, 0 where there is one.
-        id: unique among the segments of a file.
+        name: name of the segment in 3D Slicer.
+        label: label of the voxels of the segment in its layer.
+        layer: index of the layer; 0 if there is only one.
+        id: identifier, unique among the segments of a file.
     """
 
     name: str
@@ -545,13 +544,13 @@ class LabelVolume:
     """Labels in voxels, with the position of the voxels in the patient.
 
     Args:
-        labels: (X, Y, Z) whole numbers of any type, read-only, or (X, Y, Z, L) in L layers, for segments that overlap;
-            0 is what has no label.
-        affine: (4, 4) float64 from the indices of a voxel to its middle in mm: right, anterior, superior (RAS), as in
-            NIfTI and nibabel. Surfaces made of it are in LPS.
-        name: where it came from, used in messages.
-        notes: sentences on what is worth knowing of the file.
-        segments: with names, if the file has any.
+        labels: (X, Y, Z) integers of any type, read-only, or (X, Y, Z, L) in L layers for overlapping segments; 0 is
+            the background.
+        affine: (4, 4) float64 affine transform from the indices of a voxel to its centre in mm: right, anterior,
+            superior (RAS), as in NIfTI and nibabel. Surfaces of the volume are in LPS.
+        name: name of the source, used in messages.
+        notes: sentences for the user about the file.
+        segments: named segments, if the file has any.
 
     Raises:
         InputError: arrays of the wrong shape or type, or an affine that is singular or not finite.
@@ -569,7 +568,7 @@ class LabelVolume:
         labels, affine = np.asarray(self.labels).view(), read_only(self.affine)
         if labels.ndim not in (3, 4) or not labels.size or labels.dtype.kind not in "iu":
             raise InputError(
-                f"{self.name}: labels must be whole numbers of the shape (X, Y, Z), or (X, Y, Z, L) in L layers, not "
+                f"{self.name}: labels must be integers of the shape (X, Y, Z), or (X, Y, Z, L) in L layers, not "
                 f"{labels.dtype} {labels.shape}."
             )
         if affine.shape != (4, 4) or not np.isfinite(affine).all() or not np.linalg.det(affine[:3, :3]):
@@ -586,40 +585,40 @@ class LabelVolume:
 
     @property
     def voxel_mm(self) -> FloatArray:
-        """(3,) the size of a voxel along each axis of `labels`, mm."""
+        """(3,) size of a voxel along each axis of `labels`, mm."""
         return read_only(np.linalg.norm(self.affine[:3, :3], axis=0))
 
 
 def are_same_triangles(first: IntArray | None, second: IntArray | None) -> bool:
-    """Whether two arrays (F, 3) are the same triangles, in any order, orientation and from any of their corners."""
+    """Return whether two arrays (F, 3) contain the same triangles, in any order, orientation and order of corners."""
     if first is None or second is None:
         return first is second
     if first.shape != second.shape:
         return False
     if np.array_equal(first, second):
         return True
-    one, other = np.sort(first, axis=1), np.sort(second, axis=1)
-    return np.array_equal(one[np.lexsort(one.T)], other[np.lexsort(other.T)])
+    own, other = np.sort(first, axis=1), np.sort(second, axis=1)
+    return np.array_equal(own[np.lexsort(own.T)], other[np.lexsort(other.T)])
 
 
 def common_faces(meshes: Iterable[Mesh]) -> IntArray | None:
-    """Return the triangles that all `meshes` share, as the first has them, or None for point clouds.
+    """Return the common triangles of all `meshes`, as in the first mesh, or None for point clouds.
 
     Raises:
-        CorrespondenceError: two of them differ; the message names the second.
+        CorrespondenceError: two meshes differ; the message names the second.
     """
     first: Mesh | None = None
     for mesh in meshes:
         if first is None:
             first = mesh
         elif len(mesh.vertices) != len(first.vertices):
-            _refuse_pair(f"{mesh.name} has {len(mesh.vertices)} vertices but {first.name} has {len(first.vertices)}")
+            _raise_mismatch(f"{mesh.name} has {len(mesh.vertices)} vertices but {first.name} has {len(first.vertices)}")
         elif not are_same_triangles(mesh.faces, first.faces):
-            _refuse_pair(f"{mesh.name} and {first.name} have different triangles on the same number of vertices")
+            _raise_mismatch(f"{mesh.name} and {first.name} have different triangles on the same number of vertices")
     return None if first is None else first.faces
 
 
-def _refuse_pair(difference: str) -> NoReturn:
+def _raise_mismatch(difference: str) -> NoReturn:
     raise CorrespondenceError(
         f"{difference}; only meshes in vertex correspondence can be modelled or compared, so run shapespace correspond "
         "on them first."

@@ -161,10 +161,10 @@ def test_quads_of_meshio_are_two_triangles_each(mesh: ss.Mesh) -> None:
 @pytest.mark.parametrize(
     ("there", "says"),
     [
-        (3, r"builtins\.int is no mesh"),
-        ({"vertices": 1}, r"builtins\.dict is no mesh"),
+        (3, r"builtins\.int is not a mesh"),
+        ({"vertices": 1}, r"builtins\.dict is not a mesh"),
         (np.zeros((4, 2)), r"shape \(V, 3\)"),
-        (np.array([["a", "b", "c"]]), "no numbers"),
+        (np.array([["a", "b", "c"]]), "not numbers"),
         (SimpleNamespace(points=np.zeros((4, 3)), n_points=4, extract_surface=None), "extract_surface"),
         (SimpleNamespace(points=np.zeros((4, 3)), cells=[], cells_dict={"tetra": [[0, 1, 2, 3]]}), "type tetra"),
         ((np.zeros((4, 3)), np.array([[0, 1, 9]])), "points at vertex 9"),

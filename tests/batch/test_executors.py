@@ -160,7 +160,7 @@ def test_workers_that_cannot_start_are_one_sentence() -> None:
     ("told", "match"),
     [
         ({"kind": "slurm"}, "local, serial, dask"),
-        ({"dask": "tcp://x:1"}, "leave out one"),
+        ({"dask": "tcp://x:1"}, "omit one of the two"),
         ({"kind": "serial", "timeout_s": 3.0}, "hangs"),
     ],
 )

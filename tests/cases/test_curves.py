@@ -85,7 +85,7 @@ def test_one_outline_from_any_start_and_direction_aligns_to_itself(dimensions: i
     assert residuals(aligned).max() < 5e-4 and (aligned.converged or slide_by == "bending-energy")
     kept = align_landmarks(raw, AlignConfig(slide_by="procrustes", match_curves=False))
     assert residuals(kept).max() > 0.3
-    [note] = [note for note in aligned.notes if "other direction" in note]
+    [note] = [note for note in aligned.notes if "opposite direction" in note]
     named = [f"s{k}" in note.replace(";", " ").split() for k in range(20)]
     fewer = is_reversed if is_reversed.sum() < 10 else ~is_reversed
     assert all(fewer[k] for k in range(20) if named[k]) and sum(named) >= min(3, fewer.sum())

@@ -267,9 +267,9 @@ def test_a_segment_of_a_layered_file_is_chosen_by_name_or_number(
     both = surface_of_volume(volume, "bone,cartilage")
     assert both.voxels == ((layers == 1).any(axis=0)).sum() and both.labels == ("bone", "cartilage")
     for asked, said in (
-        (None, "it has the segments bone, left, tooth, cartilage; say which"),
+        (None, "it has the segments bone, left, tooth, cartilage; choose some"),
         (1, "label 1 is in several layers; choose one of bone, cartilage"),
-        ("skin", "there is no label skin in it; it has bone, left, tooth, cartilage"),
+        ("skin", "it has no label skin; choose from bone, left, tooth, cartilage"),
     ):
         with pytest.raises(InputError, match=said):
             surface_of_volume(volume, asked)
@@ -283,7 +283,7 @@ def test_segments_in_one_layer_have_names_too() -> None:
     volume = LabelVolume(layers[0], np.eye(4), segments=(Segment("bone", 1), Segment("tooth", 2), Segment("none", 7)))
     assert surface_of_volume(volume, "tooth").voxels == 8 == surface_of_volume(volume, 2).voxels
     assert surface_of_volume(volume, "all").labels == ("bone", "tooth")
-    with pytest.raises(InputError, match="there is no label none in it; it has bone, tooth"):
+    with pytest.raises(InputError, match="it has no label none; choose from bone, tooth"):
         surface_of_volume(volume, "none")
 
 

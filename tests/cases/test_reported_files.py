@@ -53,7 +53,7 @@ def test_mirrored_copies_have_the_same_triangles(reported: Path, run: Run, tmp_p
         ("06_slicer_default_labels", (6, 6, 3), 0, "matched by number"),
         ("08_curve_in_file", (5, 10, 3), 2, "are semilandmarks"),
         ("08b_curve_in_own_file", (4, 10, 3), 2, "8 files are joined to 4 specimens"),
-        ("03_same_id_other_image.tps", (8, 6, 2), 0, "called as their IMAGE="),
+        ("03_same_id_other_image.tps", (8, 6, 2), 0, "named after their IMAGE="),
         ("04_outlines_only.tps", (6, 60, 2), 59, "59 points of 1 curve are semilandmarks"),
         ("11_idav.dta", (6, 6, 3), 0, "1 missing landmark is an estimate"),
         ("12_morphologika.txt", (4, 6, 3), 0, ""),

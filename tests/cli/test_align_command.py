@@ -181,7 +181,9 @@ def test_a_folder_that_align_wrote_is_no_landmark_file(run: Run, folder: Path) -
     for command, *rest in (("align", "-o", "again"), *(("landmarks", *one) for one in landmarks)):
         name = rest.pop(0) if command == "landmarks" else ""
         refused = run(*filter(None, (command, name)), "aligned", *rest)
-        assert refused.code == 2 and "aligned is a folder that align wrote; give the landmark file" in refused.err
+        assert (
+            refused.code == 2 and "aligned is a folder that align wrote; give the original landmark file" in refused.err
+        )
 
 
 def test_columns_of_files_call_landmarks_by_their_name(run: Run, folder: Path) -> None:

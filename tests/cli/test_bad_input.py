@@ -272,7 +272,7 @@ def test_reversed_winding_is_turned_and_said(run: Run, world: World, scan_mesh: 
     partly = scan_mesh.faces.copy()
     partly[:40] = partly[:40, ::-1]
     record = fit_record(run, world, Mesh(scan_mesh.vertices, partly), tmp_path)
-    assert any("40 triangles wind against" in note for note in record["notes"])
+    assert any("40 triangles have a winding opposite" in note for note in record["notes"])
 
 
 def test_non_manifold_edges_and_several_pieces_are_kept_and_said(

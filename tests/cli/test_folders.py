@@ -48,8 +48,8 @@ def test_what_is_not_taken_from_a_folder_is_said(run: Run, world: World, tree: P
     assert outcome.code == 0
     assert outcome.facts["scans"] == 1
     assert outcome.err.splitlines()[:2] == [
-        f"shapespace: {tree}: 3 folders are not looked into (more, p1, p2); --recursive takes the meshes there.",
-        f"shapespace: {tree}: 1 broken link is not taken (gone.ply); mend or remove it.",
+        f"shapespace: {tree}: 3 folders are not searched (more, p1, p2); give --recursive to include the meshes there.",
+        f"shapespace: {tree}: 1 broken link is not used (gone.ply); repair or remove it.",
     ]
     # The folder of the results is none of scans.
     again = run("fit", world.model, tree, "-o", tree / "out", *FAST, "--quiet", "--json")
@@ -57,7 +57,7 @@ def test_what_is_not_taken_from_a_folder_is_said(run: Run, world: World, tree: P
     said = run("check", tree, "--json")
     assert len(said.facts) == 1 and "--recursive" in said.err and "gone.ply" in said.err
     empty = run("fit", world.model, tree.parent, "-o", tmp_path / "o")
-    assert empty.code == 2 and "holds no meshes; give --recursive" in empty.sentence()
+    assert empty.code == 2 and "contains no meshes; give --recursive" in empty.sentence()
 
 
 def test_recursive_takes_folders_below_and_tells_scans_apart_by_their_path(run: Run, world: World, tree: Path) -> None:

@@ -62,7 +62,7 @@ def test_landmarks_are_converted_with_their_sliders_and_what_is_left_out_is_prin
     outcome = run("landmarks", "convert", table, "-o", tmp_path / "newts.tps", "--sliders", sliders)
     assert outcome.code == 0 and "24 specimens with 9 landmarks" in outcome.out
     assert outcome.err.splitlines() == [
-        "Columns of the table (sex, site) are left out, since the format tps has none.",
+        "Columns of the table (sex, site) are omitted, since the format tps has no columns.",
         "The sliders are in newts.curveslide.csv.",
     ]
     assert (tmp_path / "newts.curveslide.csv").read_text() == "before,slide,after\n1,2,3\n"
@@ -188,7 +188,7 @@ def test_bad_input_ends_with_one_sentence(run: Run, table: Path, tmp_path: Path)
         (("landmarks", "convert", table, "-o", table), "is the file to convert"),
         (("landmarks", "convert", table, "-o", tmp_path / "a.doc"), "has no format"),
         (("landmarks", "convert", table, "-o", tmp_path / "a.csv", "--to", "word"), "there is no format 'word'"),
-        (("landmarks", "convert", table, "-o", tmp_path / "a.tps", "--object", "land"), "leave --object out"),
+        (("landmarks", "convert", table, "-o", tmp_path / "a.tps", "--object", "land"), "omit --object"),
         (
             ("landmarks", "convert", table, "-o", tmp_path / "a.tps", "--sliders", tmp_path / "bad.csv"),
             "before, slide, after",

@@ -91,7 +91,7 @@ def test_a_dangling_link_and_a_device_are_refused(run: Run, world: World, tmp_pa
 def test_a_folder_with_a_mesh_name_is_read_as_a_folder(run: Run, world: World, tmp_path: Path) -> None:
     (tmp_path / "scan.ply").mkdir()
     outcome = run("check", tmp_path / "scan.ply")
-    assert outcome.code == 2 and "holds no meshes" in outcome.sentence()
+    assert outcome.code == 2 and "contains no meshes" in outcome.sentence()
 
 
 def test_names_in_capitals_are_known(run: Run, world: World, tmp_path: Path) -> None:

@@ -64,7 +64,7 @@ def test_a_folder_stands_for_its_volumes_and_names_are_told_apart(run: Run, tmp_
     names = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert names == ["a.nii.gz.ply", "a.nii.ply", "masks_b.ply", "others_b.ply"]
     outcome = run("surface", tmp_path / "out", "-o", tmp_path / "out2")
-    assert outcome.code == 2 and "holds no volumes" in outcome.sentence()
+    assert outcome.code == 2 and "contains no volumes" in outcome.sentence()
 
 
 def test_a_bad_volume_among_others_is_set_aside_by_name(run: Run, tmp_path: Path) -> None:
@@ -96,9 +96,9 @@ def test_memory_is_limited_as_asked(run: Run, tmp_path: Path) -> None:
     ("voxels", "said"),
     [
         (np.zeros(SHAPE, dtype=np.uint8), "all its voxels are 0"),
-        (labels() + 2 * np.roll(labels(2.5), 6, axis=2), "it has the labels 1, 2; say which (--label)"),
+        (labels() + 2 * np.roll(labels(2.5), 6, axis=2), "it has the labels 1, 2; choose some (--label)"),
         (np.pad([[[1]]], 3).astype(np.uint8), "only 1 voxel"),
-        (labels() * np.float32(0.3), "not whole numbers"),
+        (labels() * np.float32(0.3), "not integers"),
         (np.stack([labels()] * 2, axis=-1), "more than one volume"),
     ],
 )  # fmt: skip
@@ -134,7 +134,7 @@ def test_labels_pieces_and_smoothing_are_as_asked(run: Run, tmp_path: Path) -> N
     assert record("--label", "all", "--keep-pieces")["left_out_voxels"] == 0
     assert record("--label", "1", "--smooth", "0")["vertices"] > 0
     absent = run("surface", path, "-o", tmp_path / "out", "--label", "3")
-    assert absent.code == 2 and "there is no label 3 in it; it has 1, 4" in absent.sentence()
+    assert absent.code == 2 and "it has no label 3; choose from 1, 4" in absent.sentence()
     for option, value in (("--label", "0"), ("--label", "one"), ("--smooth", "-1"), ("--smooth", "nan")):
         assert run("surface", path, "-o", tmp_path / "out", option, value).code == 2
 

@@ -127,7 +127,7 @@ def test_earlier_answers_nearby_change_no_distance(name: str, shape: str) -> Non
         assert np.abs(np.linalg.norm(near.points - asked, axis=1) - fresh.distance).max() < 1e-9
         if near.triangle is None:
             assert np.array_equal(near.vertex, fresh.vertex)
-    with pytest.raises(InputError, match="near"):
+    with pytest.raises(InputError, match="previous results do not match"):
         engine.query(asked[:-1], near=near)
 
 

@@ -141,7 +141,7 @@ def test_lists_of_vertices_are_read_or_refused(tmp_path: Path) -> None:
         assert read_region(file) == (3, 5)
     for text in ("", "vertex\n", "name,vertex\nx\n", "3.5\n", "-1\n", "99999999999\n"):
         file.write_text(text)
-        with pytest.raises(FileFormatError, match="no list of vertices"):
+        with pytest.raises(FileFormatError, match="not a list of vertices"):
             read_region(file)
 
 

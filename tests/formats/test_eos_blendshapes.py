@@ -51,7 +51,10 @@ def test_shape_and_blendshapes_of_two_files_are_one_additive_model(model: ShapeM
 
 def test_blendshapes_alone_are_no_model(tmp_path: Path) -> None:
     file = blendshapes(tmp_path / "expressions.bin", smiles(), ["smile", "frown"])
-    with pytest.raises(ModelFileError, match="without the model; give that, and this with --expressions"):
+    with pytest.raises(
+        ModelFileError,
+        match="contains only the blendshapes of an eos model; give the model, and this file with --expressions",
+    ):
         ShapeModel.load(file)
 
 

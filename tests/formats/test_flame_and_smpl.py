@@ -203,7 +203,7 @@ def test_allowed_names_are_never_called(tmp_path: Path) -> None:
     assert np.array_equal(read_pickle_sandboxed(path, ["v_template"]).arrays["/v_template"], parts()["v_template"])
     reader = sandbox_child._Unpickler(io.BytesIO())
     for module, name in [*sandbox_child._ARRAY_NAMES, ("chumpy.ch", "Ch")]:
-        assert issubclass(reader.find_class(module, name), sandbox_child._Noted)
+        assert issubclass(reader.find_class(module, name), sandbox_child._PickledObject)
 
 
 def laughs() -> bytes:

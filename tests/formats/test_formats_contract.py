@@ -149,5 +149,5 @@ def test_parts_that_do_not_belong_together_are_refused(change: str, model: Shape
         "modes": dataclasses.replace(linear, shape=Modes(np.zeros((5, 2)))),
         "landmark": dataclasses.replace(linear, landmarks={"tip": 300}),
     }
-    with pytest.raises(ModelFileError, match="no usable shape model"):
+    with pytest.raises(ModelFileError, match="not a valid shape model"):
         wrong[change].check(Path("model.bin"))

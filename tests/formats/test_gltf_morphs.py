@@ -168,7 +168,12 @@ def test_seams_are_joined_and_the_shape_at_rest_is_the_mean(model: ShapeModel, t
     assert np.allclose(moved[appearance < 20], (0.02, 0.0, 0.004), atol=1e-6)
     assert not moved[appearance >= 20].any()
     said = " ".join(found.notes)
-    assert "joined" in said and "weights are not zero" in said and "1 more" in said and "one standard deviation" in said
+    assert (
+        "are merged" in said
+        and "weights are not zero" in said
+        and "1 more" in said
+        and "one standard deviation" in said
+    )
 
 
 def test_a_mesh_without_targets_is_no_model(model: ShapeModel, tmp_path: Path) -> None:
@@ -189,7 +194,7 @@ def test_what_an_editor_changed_is_not_taken_for_the_model(model: ShapeModel, tm
     path.write_text(json.dumps(tree))
     found = read_gltf_model(path)
     assert not found.landmarks and found.n_training is None and found.shape.total_variance is None
-    assert any("landmarks are left out" in note for note in found.notes)
+    assert any("landmarks are omitted" in note for note in found.notes)
 
 
 def test_a_far_model_keeps_its_precision(model: ShapeModel, tmp_path: Path) -> None:
@@ -210,7 +215,7 @@ def test_many_targets_on_one_array_are_refused_before_they_are_made(tmp_path: Pa
     }
     path = tmp_path / "bomb.gltf"
     path.write_text(json.dumps(tree))
-    with pytest.raises(ShapespaceError, match="unfold to more than"):
+    with pytest.raises(ShapespaceError, match="expand to more than"):
         read_gltf_model(path)
 
 

@@ -102,7 +102,7 @@ def test_what_is_written_says_mm_and_keeps_names_and_facts(tmp_path: Path) -> No
     again = read_obj_folder(path)
     assert again.mm == 1 and again.n_training == 41 and dict(again.landmarks) == {"tip": 7}
     assert np.array_equal(again.mean, linear.mean)
-    with pytest.raises(InputError, match="is there already"):
+    with pytest.raises(InputError, match="already exists"):
         write_obj_folder(parted, path)
 
 

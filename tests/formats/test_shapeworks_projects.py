@@ -199,7 +199,7 @@ def test_a_mesh_that_lies_elsewhere_is_not_taken_for_the_surface(tmp_path: Path)
         row["groomed_1"] = "groomed/0.ply"
         row["local_particles_1"] = row["world_particles_1"]
     found = read_shapeworks(swproj(tmp_path, rows))
-    assert found.faces is None and any("does not lie where" in note for note in found.notes)
+    assert found.faces is None and any("does not match its particles" in note for note in found.notes)
 
 
 def test_written_shapes_have_the_mean_and_covariance_and_are_near(tmp_path: Path) -> None:
@@ -220,9 +220,9 @@ def test_written_shapes_have_the_mean_and_covariance_and_are_near(tmp_path: Path
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ("missing", "not there"), ("long", "cannot be|not there"), ("zero", "cannot be|not there"),
-        ("outside", "outside its own folder"), ("text", "no number|text where"),
-        ("cut", "different numbers of particles"), ("none", "names no particles"), ("one", "of 1 subjects"),
+        ("missing", "does not exist"), ("long", "invalid name|does not exist"), ("zero", "invalid name|does not exist"),
+        ("outside", "outside its folder"), ("text", "no number|text where"),
+        ("cut", "different numbers of particles"), ("none", "contains no paths of particles"), ("one", "of 1 subjects"),
         ("ragged", "rows of three"),
     ],
 )  # fmt: skip
@@ -256,7 +256,7 @@ def test_a_project_that_names_one_file_many_times_is_refused_before_it_fills_the
     monkeypatch.setattr("shapespace.io.read_limits.SPARE_BYTES", 2**20)
     np.savetxt(tmp_path / "big.particles", np.zeros((10_000, 3)), "%d")
     rows = [{"world_particles_1": "big.particles"}] * 4_000
-    with pytest.raises(ShapespaceError, match="unfold to more than"):
+    with pytest.raises(ShapespaceError, match="expand to more than"):
         read_shapeworks(swproj(tmp_path, rows))
 
 
@@ -269,7 +269,7 @@ def test_a_shared_string_of_five_thousand_digits_is_a_damaged_workbook(tmp_path:
     with zipfile.ZipFile(path, "w") as archive:
         for name, content in parts.items():
             archive.writestr(name, content)
-    with pytest.raises(ModelFileError, match=r"there is no shared string '9+'.*no project of ShapeWorks"):
+    with pytest.raises(ModelFileError, match=r"there is no shared string '9+'.*not a project of ShapeWorks"):
         read_shapeworks(path)
 
 

@@ -111,7 +111,7 @@ def test_of_tetrahedra_the_surface_is_read_seen_from_outside(tmp_path: Path) -> 
         file["representer/cells"] = cells.T.astype(np.int32)
         file["representer"].attrs["datasetType"] = np.array([b"VOLUME_MESH"])
     _, linear = read_linear(tmp_path / "m.h5")
-    assert any("1 points within are left out" in note for note in linear.notes)
+    assert any("1 interior points are omitted" in note for note in linear.notes)
     assert np.array_equal(linear.mean, one.mean)
     assert linear.shape.moved.shape == (18, 4)
 
@@ -145,8 +145,8 @@ def test_a_morphable_model_parts_identity_and_expression(kind: str, tmp_path: Pa
     moving = dataclasses.replace(truth(5, 3), mean=np.full_like(one.mean, 2.0))
     by_hand.momo(tmp_path / "m.h5", one, moving, landmark_texts(one)[kind])
     _, linear = read_linear(tmp_path / "m.h5")
-    off = "1 of 3 landmarks lie more than 0.1 % of the extent of the model off its surface and are left out."
-    assert {"Its model of colour is left out.", off} <= set(linear.notes)
+    off = "1 of 3 landmarks lie more than 0.1 % of the extent of the model off its surface and are omitted."
+    assert {"Its colour model is omitted.", off} <= set(linear.notes)
     assert linear.mm == 1.0
     model = AdditiveModel.load(tmp_path / "m.h5")
     assert model.n_identity == 4 and model.n_expression == 3
@@ -175,7 +175,7 @@ def test_a_face_model_of_199_modes_is_known_to_be_for_research_only_and_says_so(
     ("change", "told"),
     [
         ("mean", "no /model/mean"), ("pcaVariance", "no /model/pcaVariance"), ("short", "the shapes"),
-        ("negative", "below 0"), ("cells", "name points"), ("points", "its points the shape"),
+        ("negative", "below 0"), ("cells", "refer to points"), ("points", "its points the shape"),
     ],
 )  # fmt: skip
 def test_parts_that_are_missing_or_do_not_belong_together_are_named(change: str, told: str, tmp_path: Path) -> None:

@@ -90,5 +90,5 @@ def test_places_off_the_square_are_refused(uv: np.ndarray) -> None:
 def test_too_few_values_are_refused() -> None:
     weights = np.zeros(400)
     weights[:2] = 1.0
-    with pytest.raises(InputError, match="Too few"):
+    with pytest.raises(InputError, match="too few"):
         SplineSquare(places(), (5, 5)).fit(np.zeros((400, 3)), weights)

@@ -285,7 +285,7 @@ def ring(points: FloatArray) -> None:
         (lost, {}, {"missing": "refuse"}, "specimens lack landmarks"),
         (often, {}, {}, "landmark 4 is missing in 11 of 12"),
         (ring, {}, {}, "a coordinate is infinite"),
-        (None, {"curve_sliders": [[0, 1, 12]]}, {}, "name landmark 13, and there are 9"),
+        (None, {"curve_sliders": [[0, 1, 12]]}, {}, "contain landmark 13 of 9"),
         (None, {"curve_sliders": [[0, 1, 2], [3, 1, 4]]}, {}, "landmark 2 slides twice"),
         (None, {"curve_sliders": [[0, 1, 0]]}, {}, "landmark 2 needs two other landmarks"),
         (None, {"surface_sliders": [1]}, {}, "in 3-D only"),

@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from shapespace.errors import InputError
 from shapespace.geometry.doctor import examine
-from shapespace.geometry.volume_surface import VolumeSurface, _grown, _squared_distance, labels_in, surface_of_volume
+from shapespace.geometry.volume_surface import VolumeSurface, _dilate, _squared_distance, labels_in, surface_of_volume
 from shapespace.types import RAS_TO_LPS, FloatArray, LabelVolume, Mesh
 
 pytest.importorskip("skimage", reason="the extra `volumes` is not installed")
@@ -102,7 +102,7 @@ def test_distances_are_those_of_scipy_up_to_the_bound(step: Any) -> None:
 
 def test_growing_takes_all_neighbours() -> None:
     mask = np.random.default_rng(4).random((9, 8, 7)) < 0.05
-    assert (_grown(mask) == ndimage.binary_dilation(mask, np.ones((3, 3, 3)))).all()
+    assert (_dilate(mask) == ndimage.binary_dilation(mask, np.ones((3, 3, 3)))).all()
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -157,15 +157,15 @@ def _around(made: VolumeSurface) -> FloatArray:
 
 def test_a_label_is_chosen_and_several_are_one_object() -> None:
     volume = _two_balls()
-    with pytest.raises(InputError, match=r"it has the labels 1, 2; say which"):
+    with pytest.raises(InputError, match=r"it has the labels 1, 2; choose some"):
         surface_of_volume(volume)
     assert np.allclose(_around(surface_of_volume(volume, 1)), 10, atol=0.2)
     assert np.allclose(_around(surface_of_volume(volume, [2])), (30, 10, 10), atol=0.2)
     assert surface_of_volume(volume, np.uint8(2)).labels == (2,)
-    with pytest.raises(InputError, match="there is no label both in it; it has 1, 2"):
+    with pytest.raises(InputError, match="it has no label both; choose from 1, 2"):
         surface_of_volume(volume, "both")
     assert surface_of_volume(volume, "all").labels == surface_of_volume(volume, (2, 1)).labels == (1, 2)
-    with pytest.raises(InputError, match="there is no label 3 in it; it has 1, 2"):
+    with pytest.raises(InputError, match="it has no label 3; choose from 1, 2"):
         surface_of_volume(volume, 3)
 
 
@@ -174,7 +174,7 @@ def test_smaller_pieces_are_left_out_and_said_unless_they_are_kept() -> None:
     made = surface_of_volume(volume, "all")
     small = int((volume.labels == 2).sum())
     assert made.left_out == small and made.pieces == 2
-    assert made.notes == (f"1 smaller piece with {small} of {made.voxels + small} voxels is left out.",)
+    assert made.notes == (f"1 smaller piece with {small} of {made.voxels + small} voxels is omitted.",)
     kept = surface_of_volume(volume, "all", keep_pieces=True)
     assert examine(kept.mesh).components == 2 and kept.left_out == 0 and kept.notes == ("It is in 2 pieces.",)
 
@@ -218,7 +218,7 @@ def test_long_voxels_are_said() -> None:
 @pytest.mark.parametrize(
     ("labels", "what"),
     [(np.zeros((5, 5, 5)), "all its voxels are 0"), (np.pad([[[1]]], 2), "only 1 voxel;"),
-     (np.pad(np.ones((7, 1, 1)), 2), "only 7 voxels that")],
+     (np.pad(np.ones((7, 1, 1)), 2), "only 7 connected voxels")],
 )  # fmt: skip
 def test_too_few_voxels_are_refused(labels: Any, what: str) -> None:
     with pytest.raises(InputError, match=what):

@@ -50,14 +50,14 @@ def test_rows_of_points_are_read_whatever_follows_them(name: str, text: str, wri
     [
         ("a.pts", "51\n" + rows(), "declares 51 points, but 50"),
         ("a.xyz", "1 2\n3 4\n", "three or more columns"),
-        ("a.xyz", "1 2 3\n1 2 3 4\n", "no table"),
-        ("a.xyz", "3\nwater\nO 0 0 0.1\nH 0 0.7 -0.4\nH 0 -0.7 -0.4\n", "words beside"),
+        ("a.xyz", "1 2 3\n1 2 3 4\n", "not a table"),
+        ("a.xyz", "3\nwater\nO 0 0 0.1\nH 0 0.7 -0.4\nH 0 -0.7 -0.4\n", "words next to"),
         ("a.xyz", "1\n\nO 0 0 0.1\n", "molecule"),
-        ("a.xyz", "1 2 a\n1 2 3\n", "words beside"),
+        ("a.xyz", "1 2 a\n1 2 3\n", "words next to"),
         ("a.xyz", "1 2 3\n1 2 a\n", "text where a number"),
         ("a.xyz", "a\0b", "binary"),
         ("a.xyz", "# nothing\n", "no rows"),
-        ("a.pts", "version: 1\nn_points: 2\n{\n1 2\n3 4\n}\n", "no table"),
+        ("a.pts", "version: 1\nn_points: 2\n{\n1 2\n3 4\n}\n", "not a table"),
     ],
 )
 def test_other_tables_are_refused(name: str, text: str, why: str, write) -> None:
@@ -83,10 +83,10 @@ def test_a_pcd_cut_short_is_refused(data: str, write) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "why"),
     [
-        ("DATA binary", "DATA zip", "'zip'"), ("FIELDS x y", "FIELDS x a", "where x, y and z"),
-        ("SIZE 4 4", "SIZE 4 5", "type that is not known"), ("POINTS 50", "POINTS 9999999", "9999999 points"),
-        ("COUNT 1 1 2", "COUNT 1 1 999999999", "far too many"), ("POINTS 50", "POINTS x", "how many points"),
-        ("COUNT 1 1", "COUNT 2 1", "more than once"), ("TYPE F F U", "TYPE F F F", "type that is not known"),
+        ("DATA binary", "DATA zip", "'zip'"), ("FIELDS x y", "FIELDS x a", "not define x, y and z"),
+        ("SIZE 4 4", "SIZE 4 5", "unknown type"), ("POINTS 50", "POINTS 9999999", "9999999 points"),
+        ("COUNT 1 1 2", "COUNT 1 1 999999999", "per point, too many"), ("POINTS 50", "POINTS x", "number of points"),
+        ("COUNT 1 1", "COUNT 2 1", "more than once"), ("TYPE F F U", "TYPE F F F", "unknown type"),
         ("DATA binary\n", "", "no header that ends"), ("POINTS 50", "POINTS -1", "-1 points"),
     ],
 )  # fmt: skip
@@ -99,7 +99,7 @@ def test_packed_data_that_are_wrong_are_refused(packed: bytes, write) -> None:
     whole = pcd("binary_compressed", POINTS)
     start = whole.index(b"binary_compressed\n") + 18
     size = whole[start + 4 : start + 8]
-    assert "packed data" in refusal(write("a.pcd", whole[:start] + struct.pack("<I", len(packed)) + size + packed))
+    assert "compressed data" in refusal(write("a.pcd", whole[:start] + struct.pack("<I", len(packed)) + size + packed))
 
 
 @pytest.mark.parametrize(

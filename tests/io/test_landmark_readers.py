@@ -80,4 +80,4 @@ def test_points_of_a_picture_are_refused(write):
 
 
 def test_a_count_that_is_wrong_is_refused(write):
-    assert "says 3 landmarks, but 2" in refusal(write("a.pts", "3\n1 2 3\n4 5 6\n"))
+    assert "declares 3 landmarks, but 2" in refusal(write("a.pts", "3\n1 2 3\n4 5 6\n"))

@@ -167,7 +167,7 @@ def test_csv_with_and_without_header(write, text: str):
         (
             "a.ljson",
             '{"version": 2, "labels": [{"label": "a", "mask": [5]}], "landmarks": {"points": []}}',
-            "not there",
+            "does not exist",
         ),
         ("a.ljson", '{"version": 2, "landmarks": {"points": [[1, 2]]}}', "2 coordinates"),
         ("a.doc", "a,1,2,3\n", "not a landmark format"),

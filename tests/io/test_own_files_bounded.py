@@ -49,7 +49,7 @@ def peak_mib(read: Callable[[], object]) -> float:
 @pytest.mark.parametrize("reader", READERS)
 def test_no_reader_waits_at_a_pipe(reader: Callable[[Path], object], tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.fit.json")
-    with pytest.raises(FileFormatError, match="no file but a pipe"):
+    with pytest.raises(FileFormatError, match="is a pipe or a device"):
         reader(tmp_path / "pipe.fit.json")
 
 
@@ -58,7 +58,7 @@ def test_a_folder_with_a_pipe_for_a_record_is_read_and_the_pipe_told(tmp_path: P
     os.mkfifo(tmp_path / "pipe.fit.json")
     assert list(records_in(tmp_path)) == []
     (fit,) = find_fits(Folder(tmp_path))
-    assert fit.status == "unreadable" and "no file but a pipe" in fit.reason
+    assert fit.status == "unreadable" and "is a pipe or a device" in fit.reason
 
 
 @pytest.mark.parametrize("reader", READERS)

@@ -139,10 +139,10 @@ def test_each_material_has_its_own_picture(tmp_path: Path) -> None:
         ("newmtl skin of face\nmap_Kd \x1b[31m.png\n", None, "'?[31m.png' is not in its folder"),
         ("newmtl skin of face\nmap_Kd ../p.png\n", None, "outside its folder"),
         ("newmtl skin of face\nmap_Kd /etc/passwd\n", None, "outside its folder"),
-        ("newmtl skin of face\nmap_Kd p.png\n", b"no picture", "damaged or of a kind"),
-        ("newmtl skin of face\nmap_Kd p.png\n", picture()[:45], "damaged or of a kind"),
+        ("newmtl skin of face\nmap_Kd p.png\n", b"no picture", "damaged or has an unsupported format"),
+        ("newmtl skin of face\nmap_Kd p.png\n", picture()[:45], "damaged or has an unsupported format"),
         ("newmtl skin of face\nmap_Kd p.png\n", bomb(8193, 8192), "pixels, too many"),
-        ("newmtl skin of face\nmap_Kd p.png\n", bomb(2**30, 2**30), "damaged or of a kind"),
+        ("newmtl skin of face\nmap_Kd p.png\n", bomb(2**30, 2**30), "damaged or has an unsupported format"),
     ],
     ids=["absent", "not printable", "above", "absolute", "no picture", "cut short", "too large", "bomb"],
 )

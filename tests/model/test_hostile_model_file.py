@@ -92,7 +92,7 @@ def test_what_stands_in_other_files_is_never_read(parts: Any, tmp_path: Path) ->
         file["stddev"] = h5py.SoftLink("/kept")
 
     for build in (outside, virtual, link, soft):
-        refused(hostile(tmp_path / "m.h5", parts, build, without=("stddev",)), "not as shapespace writes it")
+        refused(hostile(tmp_path / "m.h5", parts, build, without=("stddev",)), "not in the layout of shapespace")
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes with names here")
@@ -135,7 +135,7 @@ def test_more_names_than_any_model_has_are_refused(tmp_path: Path) -> None:
         file["mean"] = np.zeros(1)
         for k in range(3000):
             file[f"again{k}"] = file["mean"]
-    refused(sealed(tmp_path / "m.h5", memory.getvalue()), "names stand otherwise")
+    refused(sealed(tmp_path / "m.h5", memory.getvalue()), "names are stored in another layout")
 
 
 def test_a_text_named_often_takes_no_more_memory_than_the_file_has(tmp_path: Path) -> None:
@@ -357,6 +357,6 @@ def test_a_model_is_written_as_it_is_read_whatever_h5py_is_set_to_and_else_not_a
     assert ShapeModel.load(tmp_path / "m.h5").content_hash == model.content_hash
     whole = h5py.File
     monkeypatch.setattr(h5py, "File", lambda *_, **options: whole(*_, **(options | {"libver": "latest"})))
-    with pytest.raises(FileFormatError, match=r"n\.h5 was not written: h5py .* could not be read"):
+    with pytest.raises(FileFormatError, match=r"n\.h5 was not written: h5py .* cannot be read back"):
         model.save(tmp_path / "n.h5")
     assert not (tmp_path / "n.h5").exists()

@@ -243,7 +243,7 @@ def test_two_folders_and_a_model_stand_side_by_side(tmp_path: Path, capsys: pyte
 @pytest.mark.parametrize(
     ("targets", "said"),
     [
-        (["empty"], "holds no meshes"),
+        (["empty"], "contains no meshes"),
         (["two"], "at least three meshes"),
         (["a", "two"], "compared shape by shape"),
         (["a", "a", "a"], "At most two"),

@@ -83,7 +83,7 @@ def test_what_does_not_belong_to_the_model_is_refused():
         space.transform([other])
     with pytest.raises(FileFormatError, match="record of number 1 is incomplete"):
         space.transform([{"status": "converged"}])
-    with pytest.raises(InputError, match="int is no mesh"):
+    with pytest.raises(InputError, match="int is not a mesh"):
         space.transform([3])
     with pytest.raises(InputError, match="meshes in correspondence"):
         ss.ShapeSpace().fit([other])

@@ -168,7 +168,7 @@ def test_arrays_larger_than_their_file_are_refused_before_they_are_allocated(fol
         archive.writestr("mean.npy", stream.getvalue() + b"\0" * 24)
     edit(folder, lambda demo: demo["experiment1"].update(fits=[]))
     page = write_report(folder).read_text(encoding="utf-8")
-    assert "is not what its header says" in page
+    assert "does not match its header" in page
     path.write_bytes(content[: len(content) // 2])
     assert "cut short" in write_report(folder).read_text(encoding="utf-8")
 
@@ -177,7 +177,7 @@ def test_arrays_with_pickles_are_refused(folder: Path) -> None:
     edit(folder, lambda demo: demo["experiment1"].update(fits=[]))
     np.savez(folder / "experiment2" / "fits" / "stranger.stages.npz", mean=np.array([{"a": 1}], dtype=object))
     page = write_report(folder).read_text(encoding="utf-8")
-    assert "is not what its header says" in page
+    assert "does not match its header" in page
 
 
 def test_a_damaged_demo_is_refused_in_one_sentence(tmp_path: Path) -> None:

@@ -47,7 +47,7 @@ def test_keys_that_are_not_known_are_passed_over(record: dict[str, Any]) -> None
     ("change", "told"),
     [
         ({"format": "shapespace model"}, r"^a\.fit\.json is not the record of a fit"),
-        ({"format_version": 2}, r"^a\.fit\.json has the format version 2, .* knows only 1; update shapespace"),
+        ({"format_version": 2}, r"^a\.fit\.json has the format version 2, .* supports only 1; update shapespace"),
         ({"status": "splendid"}, r"^a\.fit\.json is damaged: invalid enum value 'splendid' - at status; fit the scan"),
         ({"b": [1.0, None]}, r"damaged: expected float, got null - at b\[1\]; fit the scan again\.$"),
         ({"T_scan_model": {"scale": 1.0}}, r"damaged: missing required field rotation - at T_scan_model"),

@@ -376,7 +376,7 @@ def test_shards_without_their_manifest_are_neither_ignored_nor_removed(store: Pa
 def test_fits_of_a_shard_that_an_older_manifest_does_not_name_are_not_removed(store: Path) -> None:
     edit(store, lambda told: told["shards"].pop())
     before = content(store)
-    with pytest.raises(FileFormatError, match="nowhere else"):
+    with pytest.raises(FileFormatError, match="are in no other file"):
         Store(store).compact()
     assert content(store) == before
 

@@ -136,7 +136,7 @@ def test_a_folder_is_imported_by_reference_or_as_copies(project: Project, tmp_pa
         "anna.ply", "ben.ply", "carl.ply", "s1.ply", "s2.ply",
     ]  # fmt: skip
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="holds no meshes"):
+    with pytest.raises(InputError, match="contains no meshes"):
         project.import_files(tmp_path / "empty", "training", copy=False)
 
 

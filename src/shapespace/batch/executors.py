@@ -1,9 +1,9 @@
 """Execution of many tasks: serially in this process, in processes on this machine, or on a Dask cluster (`on_dask`).
 
-All executors have one interface, `Executor.run`, and one contract: each task has one answer, in any order, and a task
-that its workers do not survive is given up with a reason while the others continue.
+All executors have the interface `Executor.run`. It returns one answer per task, in any order. A task whose workers
+crash is given up with a reason, while the others continue.
 
-`ExecutionConfig` chooses one by its name and the settings of the command line.
+`ExecutionConfig` selects an executor by its name and the settings of the command line.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Executor(Protocol):
     """Does tasks."""
 
     def run(self, work: Work[T, R], tasks: Sequence[T], /) -> AbstractContextManager[Iterator[tuple[T, R]]]:
-        """Return a context whose value yields each task with its answer; leaving it early stops running tasks.
+        """Return a context whose value yields each task with its answer; leaving it early stops the running tasks.
 
         Raises:
             FitError: no workers are left, or none can start.
@@ -54,7 +54,7 @@ class Local:
 
     Args:
         workers: number of processes; 0 for one per core.
-        timeout_s: a task that takes longer is given up; None for no limit.
+        timeout_s: time limit of a task, s, after which it is given up; None for no limit.
         quiet: whether the first worker does not report that code is compiled.
     """
 
@@ -75,16 +75,16 @@ class Local:
 
 
 _latest = LatestValue[Any]()
-"""The value that the tasks of this process share, by its file."""
+"""Value that the tasks of this process share, by its file."""
 
 
 @dataclass(frozen=True)
 class Shared(Generic[T]):
-    """What all tasks of a work use; each worker reads it once from a file that only the run itself writes.
+    """Value that all tasks of a run use; each worker reads it once from a file that only the run writes.
 
     Args:
-        file: of the value, during the run.
-        sha256: of the file's content, so that nothing is read that another program wrote there; empty without a file.
+        file: path of the file with the value during the run.
+        sha256: SHA-256 of the content of the file, which detects changes by other programs; empty without a file.
     """
 
     file: Path
@@ -93,12 +93,12 @@ class Shared(Generic[T]):
     @staticmethod
     @contextmanager
     def by(executor: Executor, value: S, folder: Path) -> Generator[Shared[S]]:
-        """Yield a dataclass `value` as the tasks of an executor share it, during the block.
+        """Yield the shared form of a dataclass `value` for the tasks of an executor, during the block.
 
         Args:
-            executor: of the tasks; with `Serial`, nothing is written.
-            value: what is shared.
-            folder: that all workers see; made if absent.
+            executor: executor of the tasks; for `Serial`, no file is written.
+            value: value to share.
+            folder: folder that all workers can read; it is created if missing.
 
         Raises:
             FileError: it cannot be written.
@@ -106,7 +106,7 @@ class Shared(Generic[T]):
         with temporary_folder(make_folder(folder)) as temporary:
             shared = Shared[S](temporary / "shared.pickle")
             if not isinstance(executor, Serial):
-                content = pickle.dumps(replace(cast(Any, value)))  # without what it has cached
+                content = pickle.dumps(replace(cast(Any, value)))  # without cached values
                 shared = Shared[S](shared.file, hashlib.sha256(content).hexdigest())
                 write_bytes(shared.file, content)
             _latest.set(shared.file, value)
@@ -136,10 +136,10 @@ class ExecutionConfig:
     """Execution settings.
 
     Args:
-        kind: a name of `EXECUTORS`.
+        kind: name of the executor in `EXECUTORS`.
         jobs: number of parallel tasks; 0 for one per core. On a cluster it is the number of its workers.
-        timeout_s: a task that takes longer is given up; None for no limit.
-        dask: address of a Dask scheduler, a scheduler file, or empty for a cluster by Dask's configuration.
+        timeout_s: time limit of a task, s, after which it is given up; None for no limit.
+        dask: address of a Dask scheduler, a scheduler file, or empty for the cluster of Dask's configuration.
 
     Raises:
         InputError: the kind does not exist, or does not support the other settings.
@@ -154,40 +154,40 @@ class ExecutionConfig:
         if self.kind not in EXECUTORS:
             raise InputError(f"There is no executor {self.kind!r}; use one of {', '.join(EXECUTORS)}.")
         if self.dask and self.kind != "dask":
-            raise InputError(f"A Dask scheduler is for executor=dask, not {self.kind}; leave out one of them.")
+            raise InputError(f"A Dask scheduler is for executor=dask, not {self.kind}; omit one of the two.")
         if self.kind == "serial" and self.timeout_s is not None:
-            raise InputError("executor=serial cannot stop a scan that hangs; leave out timeout or executor.")
+            raise InputError("executor=serial cannot stop a scan that hangs; omit timeout or executor.")
 
     def executor(self, tasks: int, *, quiet: bool = True) -> Executor:
         """Return the executor for a number of tasks.
 
         Args:
-            tasks: their number; one task alone runs in this process where nothing else is asked for.
+            tasks: number of tasks; a single task runs in this process unless settings request otherwise.
             quiet: whether workers do not report that code is compiled.
         """
         return EXECUTORS[self.kind](self, tasks, quiet)
 
 
-def _local(execution: ExecutionConfig, tasks: int, quiet: bool) -> Executor:
+def _make_local(execution: ExecutionConfig, tasks: int, quiet: bool) -> Executor:
     workers = min(execution.jobs or cores(), tasks)
     if workers <= 1 and execution.timeout_s is None:
         return Serial()
     return Local(max(workers, 1), execution.timeout_s, quiet)
 
 
-def _serial(_execution: ExecutionConfig, _tasks: int, _quiet: bool) -> Executor:
+def _make_serial(_execution: ExecutionConfig, _tasks: int, _quiet: bool) -> Executor:
     return Serial()
 
 
-def _dask(execution: ExecutionConfig, _tasks: int, _quiet: bool) -> Executor:
-    from shapespace.batch.on_dask import OnDask  # needs the extra
+def _make_dask(execution: ExecutionConfig, _tasks: int, _quiet: bool) -> Executor:
+    from shapespace.batch.on_dask import OnDask  # needs the extra `cluster`
 
     return OnDask(execution.dask, execution.timeout_s)
 
 
 EXECUTORS: dict[str, Callable[[ExecutionConfig, int, bool], Executor]] = {
-    "local": _local,
-    "serial": _serial,
-    "dask": _dask,
+    "local": _make_local,
+    "serial": _make_serial,
+    "dask": _make_dask,
 }
 """Executors by name: functions of the settings, the number of tasks, and whether to be quiet."""

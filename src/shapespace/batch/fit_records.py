@@ -48,28 +48,28 @@ def _resolved_folder(folder: Path) -> Path:
     return folder.resolve()
 
 
-def _resolved(file: Path) -> Path:
-    """Return the real path of `file`; that of its folder is cached, since it takes longest."""
+def _resolve(file: Path) -> Path:
+    """Return the real path of `file`; the real path of its folder is cached, since it takes most of the time."""
     return file.resolve() if file.is_symlink() else _resolved_folder(file.parent.absolute()) / file.name
 
 
 def source_of(file: Path, content_hash: str, folder: Path) -> File:
-    """Return an input file of a fit as results in `folder` refer to it.
+    """Return the reference to an input file of a fit for results in `folder`.
 
     Args:
-        file: the file.
-        content_hash: SHA-256 of its content; the content hash of a model.
-        folder: of the results, to which its path is relative where possible.
+        file: path of the file.
+        content_hash: SHA-256 of its content, or the content hash of a model.
+        folder: folder of the results, to which the path is relative if possible.
     """
     try:
-        path = os.path.relpath(_resolved(file), _resolved_folder(folder.absolute()))
-    except (ValueError, OSError):  # another drive, or a folder that is gone
+        path = os.path.relpath(_resolve(file), _resolved_folder(folder.absolute()))
+    except (ValueError, OSError):  # another drive, or a removed folder
         path = str(file)
     return File(name=file.name, hash=content_hash, path=Path(path).as_posix())
 
 
 def hashed_source(file: Path, folder: Path) -> File:
-    """Return an input file with its hash, size and time of change.
+    """Return the reference to an input file with its hash, size and modification time.
 
     Raises:
         FileError: it cannot be read.
@@ -83,7 +83,7 @@ def hashed_source(file: Path, folder: Path) -> File:
 def fit_identity(
     scan_hash: str, model_hash: str, config: Mapping[str, Any], landmarks_hash: str = "", version: str = __version__
 ) -> str:
-    """Return the SHA-256 of scan, model, landmarks, settings and version of a fit, not of their names."""
+    """Return the SHA-256 of scan, model, landmarks, settings and version of a fit, independent of file names."""
     inputs = {"scan": scan_hash, "model": model_hash, "landmarks": landmarks_hash, "config": dict(config)}
     return hashlib.sha256(json.dumps(inputs | {"version": version}, sort_keys=True).encode()).hexdigest()
 
@@ -98,11 +98,11 @@ def fit_record(
     """Return the record of a fit, the content of NAME.fit.json.
 
     Args:
-        result: the fit.
-        scan: the scan.
-        model: the model.
-        landmarks: the file of landmarks from which the fit started; None without landmarks.
-        metadata: of the scan, by the columns of a list of scans.
+        result: result of the fit.
+        scan: reference to the file of the scan.
+        model: reference to the file of the model.
+        landmarks: reference to the file of initial landmarks; None without landmarks.
+        metadata: metadata of the scan, by the columns of a list of scans.
     """
     T = result.T_scan_model
     marks = landmarks.hash if landmarks else ""
@@ -163,7 +163,7 @@ def _size_of_surface(result: FitResult) -> dict[str, Any]:
 
 
 def _found_landmarks(result: FitResult) -> dict[str, FoundLandmark]:
-    """Return the model's landmarks on the fitted surface; empty where the model has none."""
+    """Return the landmarks of the model on the fitted surface; empty if the model has no landmarks."""
     stddev_mm = result.landmark_stddev_mm or {}
     return {
         name: FoundLandmark(at=point.tolist(), stddev_mm=stddev_mm[name].tolist() if name in stddev_mm else None)
@@ -210,7 +210,7 @@ def write_record(path: Path, record: FitRecord) -> None:
 
     Raises:
         FileError: the folder cannot be written, or the disk is full.
-        FileFormatError: the record holds values that `read_record` would refuse.
+        FileFormatError: the record contains values that `read_record` would reject.
     """
     content = record.to_json()
     FitRecord.from_json(content, path.name)
@@ -218,7 +218,7 @@ def write_record(path: Path, record: FitRecord) -> None:
 
 
 def read_record(path: Path) -> FitRecord:
-    """Return the record in a NAME.fit.json, or the one of a store that such a file would hold.
+    """Return the record in a NAME.fit.json, or the record of this name in a store.
 
     Raises:
         FileError: it cannot be read.
@@ -233,7 +233,7 @@ def read_record(path: Path) -> FitRecord:
 def write_fitted_mesh(
     path: Path, result: FitResult, model: ShapeModel, stage: str = "final", identity: str = ""
 ) -> None:
-    """Write the surface at `stage` as PLY, in the model's vertex order and the scan's own frame and unit.
+    """Write the surface at `stage` as PLY, in the vertex order of the model and the frame and unit of the scan.
 
     Its header contains `identity`, the `id` of the record.
     """
@@ -249,12 +249,12 @@ def is_surface_of(path: Path, record: FitRecord) -> bool:
 def write_stages(path: Path, result: FitResult, model: ShapeModel) -> None:
     """Write `stage_arrays` as NAME.stages.npz."""
     with atomic_path(path) as temporary:
-        arrays: dict[str, Any] = dict(stage_arrays(result, model))  # savez has keywords of its own type
+        arrays: dict[str, Any] = dict(stage_arrays(result, model))  # the keywords of savez have another type
         np.savez_compressed(temporary, **arrays)
 
 
 def write_coefficients(path: Path, rows: Sequence[Mapping[str, Any]], n_modes: int) -> None:
-    """Write the coefficient table, one row a scan, in the order given.
+    """Write the coefficient table with one row per scan, in the given order.
 
     Raises:
         FileError: the folder cannot be written, or the disk is full.

@@ -1,6 +1,6 @@
-"""One scan of a batch: its fit, its result files, and whether the result of an earlier run is still valid.
+"""Fit of one scan of a batch, its result files, and the check whether results of earlier runs are valid.
 
-`save_fit` writes a fit made in Python as the command line does.
+`save_fit` writes the result of a fit in Python like the command line.
 """
 
 from __future__ import annotations
@@ -51,11 +51,11 @@ class Job:
     """One scan to fit.
 
     Args:
-        name: NAME of its result files, unique in the folder.
-        scan: path of the scan; of one that lies elsewhere, what it would be, for its name.
-        landmarks: path of its landmarks, or None.
-        metadata: what is known of it, by the columns of a list of scans; carried to its record.
-        address: of a scan that lies elsewhere, as fsspec knows it; else empty.
+        name: NAME of the result files, unique in the folder.
+        scan: path of the scan; for a remote scan, a path with its file name.
+        landmarks: path of the landmarks of the scan, or None.
+        metadata: metadata of the scan, by the columns of a list of scans; copied to its record.
+        address: address of a remote scan for fsspec; empty for a local file.
     """
 
     name: str
@@ -66,12 +66,12 @@ class Job:
 
     @property
     def label(self) -> str:
-        """The scan in messages: its address or path."""
+        """Name of the scan in messages: its address or path."""
         return self.address or str(self.scan)
 
     @contextlib.contextmanager
     def readable(self) -> Generator[Path]:
-        """Yield a file with the scan, which is a copy during the block where the scan lies elsewhere.
+        """Yield the path of the scan; for a remote scan, that of a copy, which exists during the block.
 
         Raises:
             FileError: it cannot be fetched.
@@ -83,11 +83,11 @@ class Job:
             yield file
 
     def source(self, folder: Path) -> File:
-        """Return what results in `folder` say of where the scan is, without reading it."""
+        """Return the reference to the scan for results in `folder`, without reading the scan."""
         return File(name=self.scan.name, path=self.address) if self.address else source_of(self.scan, "", folder)
 
     def read_source(self, file: Path, folder: Path) -> File:
-        """Return the same, with what the scan is known again by; `file` is that of `readable`.
+        """Return the reference with the hash or version of the scan; `file` is the path from `readable`.
 
         Raises:
             FileError: it cannot be read.
@@ -108,12 +108,12 @@ def fit_file(
     stages: bool = False,
     on_state: Callable[[IcpState], None] | None = None,
 ) -> FitRecord:
-    """Fit one scan from its file, write its results into `folder`, and return its record, as `FitWork.do`."""
+    """Fit one scan from its file, write its results into `folder`, and return its record, see `FitWork.do`."""
     return FitWork.of(model, model_file, folder, on_state).do(FitTask(job, config, stages, resume=False))
 
 
 def publish(result: FitResult, record: FitRecord, name: str, folder: Path, *, stages: bool) -> None:
-    """Write the record and the surfaces of a fit together, and remove what an earlier one of that name left.
+    """Write the record and the surfaces of a fit together, and remove other files of an earlier fit of that name.
 
     Raises:
         FileError: they cannot be written.
@@ -128,26 +128,26 @@ def publish(result: FitResult, record: FitRecord, name: str, folder: Path, *, st
     texts = fiducial_texts(landmarks) if landmarks else {}
     writes |= {files[ending]: partial(write_text, text=text) for ending, text in texts.items()}
     writes[files["record"]] = partial(write_record, record=record)
-    write_together(writes, _stale(files, dense=not dense, stages=not stages, landmarks=not texts))
+    write_together(writes, _find_stale(files, dense=not dense, stages=not stages, landmarks=not texts))
 
 
 def _write_failed(record: FitRecord, job: Job, folder: Path) -> FitRecord:
     files = _files(job.name, folder)
-    # An earlier run's surface would contradict the record.
-    stale = [files["fitted"], *_stale(files, dense=True, stages=True, landmarks=True)]
+    # The surface of an earlier run would contradict the record.
+    stale = [files["fitted"], *_find_stale(files, dense=True, stages=True, landmarks=True)]
     write_together({files["record"]: partial(write_record, record=record)}, stale)
     return record
 
 
 def _files(name: str, folder: Path) -> dict[str, Path]:
-    """Return where the results of one scan are: by what they are, and landmarks by their endings."""
+    """Return the paths of the results of a scan: by type, and those of landmarks by ending."""
     endings = {"record": RECORD, **ENDINGS, **{ending: ending for ending in FIDUCIAL_ENDINGS}}
     return {what: folder / f"{name}{ending}" for what, ending in endings.items()}
 
 
-def _stale(files: Mapping[str, Path], *, dense: bool, stages: bool, landmarks: bool) -> list[Path]:
-    """Return what an earlier fit may have left that this one does not write."""
-    # Files without a record may be a scan and its landmarks of the user, not results.
+def _find_stale(files: Mapping[str, Path], *, dense: bool, stages: bool, landmarks: bool) -> list[Path]:
+    """Return the files of an earlier fit that this fit does not write."""
+    # Without a record, such files may be a scan and landmarks of the user, not results.
     left = [files["dense"]] if dense and files["record"].is_file() else []
     if landmarks and has_written_landmarks(files["record"]):
         left += [files[ending] for ending in FIDUCIAL_ENDINGS]
@@ -155,7 +155,7 @@ def _stale(files: Mapping[str, Path], *, dense: bool, stages: bool, landmarks: b
 
 
 def naming(source: Path | str, sentence: str) -> str:
-    """Return `sentence` about a mesh with its path or address in it, not just its file's name."""
+    """Return `sentence` about a mesh with its path or address instead of its file name."""
     if str(source) in sentence:
         return sentence
     name = name_of(source) if isinstance(source, str) and is_address(source) else Path(source).name
@@ -166,7 +166,7 @@ def naming(source: Path | str, sentence: str) -> str:
 
 @dataclass(frozen=True)
 class FitTask:
-    """What to do with one scan: its job, the settings, whether to write the stages too, and to keep what holds."""
+    """Task for one scan: its job, the settings, whether to write the stages, and whether to reuse valid results."""
 
     job: Job
     config: FitConfig
@@ -179,11 +179,11 @@ class FitWork:
     """Fits scans by one model, for an executor.
 
     Args:
-        model_file: which each worker reads once.
-        model_hash: its content hash.
-        folder: where results go.
-        run: a word that no other run has.
-        on_state: called with each state of the loop; None where workers are other processes.
+        model_file: path of the model, which each worker reads once.
+        model_hash: content hash of the model.
+        folder: folder of the results.
+        run: unique identifier of the run.
+        on_state: function that is called with each state of the iteration; None if workers are other processes.
     """
 
     model_file: Path
@@ -195,12 +195,12 @@ class FitWork:
     def do(self, task: FitTask) -> FitRecord:
         """Fit one scan from its file, write its results, and return its record.
 
-        A scan that cannot be fitted gives a record with status `failed`. Interrupted at any moment, the record in the
-        folder belongs to the surfaces in the folder. A valid result, such as that of a worker which was lost later, is
-        returned as it is.
+        A scan that cannot be fitted results in a record with status `failed`. After an interruption at any moment, the
+        record and the surfaces in the folder belong together. A valid result, such as that of a worker that crashed
+        later, is returned unchanged.
 
         Raises:
-            FileError: the model cannot be read, or the results not written.
+            FileError: the model cannot be read, or the results cannot be written.
         """
         if task.resume:
             task, earlier = resumed(task, self.model_hash, self.folder, self.run)
@@ -228,7 +228,7 @@ class FitWork:
         return record
 
     def give_up(self, task: FitTask, reason: str) -> FitRecord:
-        """Write and return the record of a scan whose workers were lost."""
+        """Write and return the record of a scan whose workers crashed."""
         model = source_of(self.model_file, self.model_hash, self.folder)
         scan = task.job.source(self.folder)
         if not task.job.address:
@@ -248,7 +248,7 @@ class FitWork:
     def _load(self) -> ShapeModel:
         model = ShapeModel.load(self.model_file)
         if model.content_hash != self.model_hash:
-            raise FileError(f"{self.model_file} is not the model that this run began with; start it again.")
+            raise FileError(f"{self.model_file} has changed since this run began; start it again.")
         return model
 
 
@@ -257,16 +257,16 @@ _model = LatestValue[ShapeModel]()
 
 
 def has_surface(job: Job, folder: Path) -> bool:
-    """Return whether `folder` holds the surface of an earlier fit of the scan."""
+    """Return whether `folder` contains the surface of an earlier fit of the scan."""
     files = _files(job.name, folder)
     return files["fitted"].is_file() and files["record"].is_file()
 
 
 def resumed(task: FitTask, model_hash: str, folder: Path, run: str = "") -> tuple[FitTask, FitRecord | None]:
-    """Return what is left to do, and the record of an earlier fit if it holds what is asked for, or more.
+    """Return the remaining task, and the record of a valid earlier fit with at least the requested results, or None.
 
-    A fit that has to be done again for the stages, say, keeps the dense surface that it had. A scan that was given up
-    is tried again by another run, not by `run` itself.
+    If a fit is repeated, for example to write its stages, its dense surface is kept. A scan that was given up is
+    repeated by other runs, but not by `run`.
     """
     files = _files(task.job.name, folder)
     if not files["record"].is_file():
@@ -291,15 +291,15 @@ def resumed(task: FitTask, model_hash: str, folder: Path, run: str = "") -> tupl
 
 
 def is_fit_of(identity: str, recorded: File, task: FitTask, model_hash: str, folder: Path, *, dense: bool) -> bool:
-    """Return whether a result in `folder` is of the scan, model, landmarks and settings of a task.
+    """Return whether a result in `folder` belongs to the scan, model, landmarks and settings of a task.
 
     Args:
-        identity: of the result; empty if it is no fit.
-        recorded: the scan in its record.
-        task: the task.
+        identity: identity of the result; empty if it is not a fit.
+        recorded: reference to the scan in the record of the result.
+        task: task for the scan.
         model_hash: content hash of the model.
-        folder: of the results.
-        dense: whether the result has a dense surface, which the task need not ask for.
+        folder: folder of the results.
+        dense: whether the result has a dense surface, even if the task does not request it.
 
     Raises:
         FileError: the scan or its landmarks cannot be read or reached.
@@ -311,14 +311,14 @@ def is_fit_of(identity: str, recorded: File, task: FitTask, model_hash: str, fol
 
 
 def is_same_scan(recorded: File, job: Job, folder: Path) -> bool:
-    """Return whether the scan of `job` is the one that a result in `folder` was made of.
+    """Return whether the scan of `job` is that of a result in `folder`.
 
-    By place, size and time of change if they agree, else by its content; at an address by what is said of its version.
+    Scans are compared by path, size and modification time, or else by content; remote scans by version.
 
     Args:
-        recorded: the scan in the record of the result.
-        job: the scan.
-        folder: of the result.
+        recorded: reference to the scan in the record of the result.
+        job: job with the scan.
+        folder: folder of the result.
 
     Raises:
         FileError: it cannot be read or reached.
@@ -335,13 +335,13 @@ def is_same_scan(recorded: File, job: Job, folder: Path) -> bool:
 
 _FORBIDDEN = re.compile(r'[<>:"/\\|?*\x00-\x1f]')
 """Characters that file names cannot contain on some systems."""
-_HASH_CHARACTERS = 12  # hexadecimal digits, 48 bits: no two of a million scans share them by chance
+_HASH_CHARACTERS = 12  # hexadecimal digits, 48 bits: unique for a million scans
 
 
 def save_fit(result: FitResult, folder: Path, name: str, *, stages: bool) -> Path:
     """Implement `FitResult.save`."""
     if name and (_FORBIDDEN.search(name) or name in (".", "..")):
-        raise InputError(f"{name!r} cannot be the name of files; leave out slashes, colons and the like.")
+        raise InputError(f"{name!r} is not a valid file name; remove slashes, colons and similar characters.")
     make_folder(folder)
     with only_writer(folder):
         scan = _scan_source(result, folder)
@@ -380,7 +380,7 @@ def _landmarks_source(result: FitResult) -> File | None:
 
 
 def _free_name(scan: File, folder: Path) -> str:
-    """Return NAME for a scan without a file: its own name, unless another scan has results of that name."""
+    """Return NAME for a scan without a file: its name, unless another scan has results with that name."""
     stem = _FORBIDDEN.sub("_", Path(scan.name).stem).strip(". ") or "scan"
     results = Results(folder)
     try:

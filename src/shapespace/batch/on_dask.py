@@ -1,4 +1,4 @@
-"""Execution on a Dask cluster: few chunks in flight, tasks of lost workers repeated, and only answers sent back."""
+"""Execution on a Dask cluster: few chunks at a time, repetition of tasks of lost workers, and small answers."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 CHUNKS_A_WORKER = 50
-"""Chunks for each worker in a run: enough that all workers end at about the same time."""
+"""Number of chunks per worker in a run: enough that all workers end at about the same time."""
 LARGEST_CHUNK = 50
-"""Largest number of tasks in a chunk: few enough that little is lost with a worker."""
+"""Largest number of tasks in a chunk: few enough that little work is lost with a worker."""
 AHEAD = 2
-"""Chunks that wait at each worker beside the running one."""
+"""Number of waiting chunks per worker in addition to the running one."""
 FINDS_S = 30.0
-"""Time for the scheduler to answer."""
+"""Time limit for an answer of the scheduler, s."""
 WORKERS_S = 600.0
-"""Time for a queue to start the first worker."""
+"""Time limit for a queue to start the first worker, s."""
 REPORT_S = 10.0
-"""Seconds without a worker after which a line on standard error says what the command waits for."""
+"""Time without a worker after which a message on standard error names the reason for waiting, s."""
 _MOST_NAMED = 5  # workers listed in a message, so that it stays one line
-_LOST = "its workers ended again and again, most likely for lack of memory; thin it"
+_LOST = "its workers crashed repeatedly, probably for lack of memory; decimate it"
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,9 @@ class OnDask:
     """On a Dask cluster, whose workers see the same files under the same paths.
 
     Args:
-        cluster: address of the scheduler, path of its scheduler file, a `distributed.Client` that is open already, or
-            empty for a cluster of this machine as Dask's configuration has it.
-        timeout_s: a task that takes longer is given up; None for no limit.
+        cluster: address of the scheduler, path of its scheduler file, an open `distributed.Client`, or empty for the
+            cluster of Dask's configuration on this machine.
+        timeout_s: time limit of a task, s, after which it is given up; None for no limit.
     """
 
     cluster: str | Client = ""
@@ -82,12 +82,12 @@ class OnDask:
         except (OSError, TimeoutError, ValueError) as error:
             location = f"at {self.cluster}" if self.cluster else "on this machine"
             raise InputError(
-                f"There is no Dask scheduler {location} that answers; start it, or correct --set dask=ADDRESS."
+                f"No Dask scheduler {location} responds; start it, or correct --set dask=ADDRESS."
             ) from error
 
 
 class _Run:
-    """One run of many tasks, sent as chunks of their numbers."""
+    """A run of many tasks, which are sent in chunks of task numbers."""
 
     def __init__(self, client: Client, work: Work[Any, Any], tasks: Sequence[Any], timeout_s: float | None) -> None:
         self._client: Any = client
@@ -96,42 +96,43 @@ class _Run:
         self._suspects: list[int] = []
 
     def answers(self) -> Generator[tuple[Any, Any]]:
-        """Yield each task with what came of it.
+        """Yield each task with its answer.
 
-        Dask blames all tasks that wait at a worker for its death, so those are tried again at the end, one at a time.
+        Dask attributes the crash of a worker to all tasks that wait there, so these are repeated at the end, one at a
+        time.
         """
         workers = self._workers()
         self._check_versions()
         size = max(1, min(LARGEST_CHUNK, len(self._tasks) // (workers * CHUNKS_A_WORKER)))
         chunks = [range(start, min(start + size, len(self._tasks))) for start in range(0, len(self._tasks), size)]
         try:
-            yield from self._each(chunks, (1 + AHEAD) * workers)
+            yield from self._run_chunks(chunks, (1 + AHEAD) * workers)
             suspects, self._suspects = self._suspects, []
-            yield from self._each([[number] for number in suspects], 1)
+            yield from self._run_chunks([[number] for number in suspects], 1)
             for number in self._suspects:
                 yield self._tasks[number], self._work.give_up(self._tasks[number], _LOST)
         finally:
             self._client.cancel(list(self._flying), force=True)
 
-    def _each(self, chunks: Sequence[Sequence[int]], at_a_time: int) -> Generator[tuple[Any, Any]]:
+    def _run_chunks(self, chunks: Sequence[Sequence[int]], at_a_time: int) -> Generator[tuple[Any, Any]]:
         from distributed import as_completed
         from distributed.scheduler import KilledWorker
 
         left = iter(chunks)
         ended: Any = as_completed(self._submit(left, at_a_time), raise_errors=False)
         for future in ended:
-            if future.status == "lost":  # its worker died with the answer, and another one does it again
+            if future.status == "lost":  # its worker crashed before sending the answer, and another worker repeats it
                 ended.add(future)
                 continue
             numbers = self._flying.pop(future)
             if future.status == "cancelled":
-                raise FitError("The Dask scheduler is gone; start it and run the same command again: it goes on.")
+                raise FitError("The Dask scheduler is gone; start it and run the same command again to continue.")
             error = future.exception() if future.status == "error" else None
             if isinstance(error, KilledWorker):
                 self._suspects.extend(numbers)
             elif error is not None:
                 if not isinstance(error, ShapespaceError):
-                    # A worker of another version that joined later may fail anywhere, such as when it loads the tasks.
+                    # A worker with another version that joined later may fail at any step, such as loading the tasks.
                     self._check_versions()
                 raise error
             answers: list[Any] = [] if error is not None else future.result()
@@ -159,15 +160,15 @@ class _Run:
                 self._client.wait_for_workers(1, timeout=WORKERS_S)
         except TimeoutError as error:
             raise FitError(
-                f"The Dask cluster has no worker after {WORKERS_S:g} s; start some and run again."
+                f"The Dask cluster has no worker after {WORKERS_S:g} s; start workers and run again."
             ) from error
         return max(1, len(self._client.nthreads()))
 
     def _check_versions(self) -> None:
-        """Refuse workers with another version of shapespace than this process, or with none.
+        """Check that all workers have the version of shapespace of this process.
 
         Raises:
-            FitError: there are such workers.
+            FitError: workers have another version, or shapespace is not installed there.
         """
         versions: Mapping[str, object] = self._client.run(_version_reader(), on_error="return")
         by_version: dict[str, list[str]] = {}
@@ -179,10 +180,10 @@ class _Run:
 
 
 def _version_reader() -> Callable[[], str]:
-    """Return a function that finds the version of shapespace at a worker.
+    """Return a function that determines the version of shapespace at a worker.
 
-    It is defined here, not in the module, because Dask then sends its code: a worker of another version may not have
-    this module, and `Client.get_versions` finds what is installed, not what is imported.
+    It is a nested function because Dask then sends its code: a worker with another version may not have this module,
+    and `Client.get_versions` finds the installed version, not the imported one.
     """
 
     def version_here() -> str:
@@ -203,15 +204,15 @@ def _other_versions(by_version: Mapping[str, Sequence[str]]) -> str:
     )
     return (
         f"This process uses shapespace {__version__}, but Dask workers have another version ({others}); install the "
-        "same version on all of them and restart the workers."
+        "same version on all machines and restart the workers."
     )
 
 
 def do_chunk(work: Work[Any, R], tasks: Sequence[Any], timeout_s: float | None, version: str) -> list[R]:
-    """Do some tasks at a worker of Dask, in a process below it that may die without it.
+    """Do tasks at a worker of Dask, in a child process whose crash does not end the worker.
 
     Raises:
-        FitError: the worker, which may have joined after the versions were checked, does not have `version`.
+        FitError: the worker, which may have joined after the check of versions, does not have `version`.
     """
     if version != __version__:
         from distributed import get_worker
@@ -229,4 +230,4 @@ def do_chunk(work: Work[Any, R], tasks: Sequence[Any], timeout_s: float | None, 
 
 
 _thread = threading.local()
-"""The process below each thread of a worker, as a team of one, and its work."""
+"""Child process of each thread of a worker, as a team with one member, and its work."""

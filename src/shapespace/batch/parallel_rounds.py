@@ -1,4 +1,4 @@
-"""Correspondence by an executor: the tasks of a round, whose results are stored as soon as they are computed."""
+"""Correspondence with an executor: tasks of a round, whose results are stored as soon as they are computed."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ class RoundRunner:
     """Runs the tasks of a round by an executor; results are stored in `folder`, and equal tasks reuse them.
 
     Args:
-        folder: of the stored results; made if absent.
-        execution: where tasks run.
+        folder: folder of the stored results; it is created if missing.
+        execution: execution settings of the tasks.
         quiet: whether workers do not report that code is compiled.
-        on_done: called after each task.
+        on_done: function that is called after each task.
     """
 
     folder: Path
@@ -45,7 +45,7 @@ class RoundRunner:
     on_done: Callable[[], None]
 
     def __call__(self, context: RoundContext, tasks: Sequence[RegistrationTask]) -> Iterator[ScanRegistration]:
-        """Yield what came of each task as it ends.
+        """Yield the result of each task as it ends.
 
         Raises:
             FileError: a result cannot be written.
@@ -71,10 +71,10 @@ class RoundRunner:
         ):
             for task, _ in results:
                 self.on_done()
-                yield _read_again(task)
+                yield _read_written(task)
 
 
-def _read_again(task: _FileTask) -> ScanRegistration:
+def _read_written(task: _FileTask) -> ScanRegistration:
     placed = _read(task.file, task.registration.index)
     if placed is None:
         raise FileError(f"Cannot read {task.file}, which this run wrote; run again.")
@@ -94,13 +94,13 @@ class RoundWork:
     """Registers scans in one round context, for an executor.
 
     Args:
-        context: of the round.
+        context: context of the round.
     """
 
     context: Shared[RoundContext]
 
     def do(self, task: _FileTask) -> None:
-        """Register a scan and write the result, unless it is there already.
+        """Register a scan and write the result, unless it already exists.
 
         Raises:
             FileError: it cannot be written.
@@ -109,7 +109,7 @@ class RoundWork:
             _write(task.file, self.context.value().register(task.registration))
 
     def give_up(self, task: _FileTask, reason: str) -> None:
-        """Write the result that excludes a scan whose workers were lost.
+        """Write the result that excludes a scan whose workers crashed.
 
         Raises:
             FileError: it cannot be written.
@@ -118,35 +118,35 @@ class RoundWork:
 
 
 def _shared_hash(context: RoundContext, pose_model: PoseModel) -> str:
-    """Return the hash of what the tasks that use `pose_model` share."""
-    return content_hash(dict(_flat(replace(context, pose_models=(pose_model,)), "context")), {})
+    """Return the hash of the data that the tasks with `pose_model` share."""
+    return content_hash(dict(_flatten(replace(context, pose_models=(pose_model,)), "context")), {})
 
 
 def _key(task: RegistrationTask, shared: str) -> str:
-    anywhere = replace(task, index=0, pose_model=0)  # a scan has the same result wherever it is in the list
-    return content_hash(dict(_flat(anywhere, "task")), {"shared": shared, "version": __version__})
+    anywhere = replace(task, index=0, pose_model=0)  # the result does not depend on the position in the list
+    return content_hash(dict(_flatten(anywhere, "task")), {"shared": shared, "version": __version__})
 
 
-def _flat(value: object, name: str) -> Iterator[tuple[str, npt.NDArray[Any]]]:
-    """Yield all that `value` contains as arrays, whatever its fields are, so that none is forgotten."""
+def _flatten(value: object, name: str) -> Iterator[tuple[str, npt.NDArray[Any]]]:
+    """Yield name and array of everything that `value` contains, for any fields, so that no field is missed."""
     if isinstance(value, np.ndarray):
         yield name, cast(npt.NDArray[Any], value)
     elif is_dataclass(value):
         for field in fields(value):
-            yield from _flat(getattr(value, field.name), f"{name}.{field.name}")
+            yield from _flatten(getattr(value, field.name), f"{name}.{field.name}")
     elif isinstance(value, Mapping):
-        for key, one in cast(Mapping[str, object], value).items():
-            yield from _flat(one, f"{name}.{key}")
+        for key, item in cast(Mapping[str, object], value).items():
+            yield from _flatten(item, f"{name}.{key}")
     elif isinstance(value, tuple):
-        for number, one in enumerate(cast(tuple[object, ...], value)):
-            yield from _flat(one, f"{name}.{number}")
+        for number, item in enumerate(cast(tuple[object, ...], value)):
+            yield from _flatten(item, f"{name}.{number}")
     elif value is not None:
         yield name, np.array(value)
 
 
 def _write(file: Path, placed: ScanRegistration) -> None:
     several = (placed, *placed.alternatives)
-    write_arrays(file, dict(_flat(tuple(replace(one, alternatives=()) for one in several), "")))
+    write_arrays(file, dict(_flatten(tuple(replace(registration, alternatives=()) for registration in several), "")))
 
 
 def _read(file: Path, index: int) -> ScanRegistration | None:
@@ -163,7 +163,7 @@ def _read(file: Path, index: int) -> ScanRegistration | None:
 
 
 def _registration(stored: Arrays) -> ScanRegistration:
-    """Return the registration that `_flat` made arrays of; arrays without axes are numbers and texts."""
+    """Return the registration from the arrays of `_flatten`; arrays without axes are numbers and texts."""
     parts: dict[str, dict[str, Any]] = {}
     values: dict[str, Any] = {}
     for key, array in stored.items():

@@ -18,10 +18,10 @@ from tqdm import tqdm
 FIRST_LOG_LINE_S = 5.0
 """Seconds until the first log line of a step, if there is no terminal."""
 LONGEST_PAUSE_S = 60.0
-"""Longest pause between two log lines of one step, s; pauses double up to it, so that logs stay short."""
+"""Longest pause between two log lines of a step, s; pauses double up to this limit, to keep logs short."""
 PROGRESS_VARIABLE = "SHAPESPACE_PROGRESS"
-"""Environment variable with the name of a JSON file that another program reads the progress from."""
-_WRITE_EVERY_S = 0.3  # at most so often
+"""Environment variable with the path of a JSON file from which another program reads the progress."""
+_WRITE_EVERY_S = 0.3  # s, shortest time between two writes
 
 
 if TYPE_CHECKING:
@@ -34,15 +34,15 @@ class Bar(_Tqdm):
     """A progress bar that also counts when it is not drawn."""
 
     counted: float = 0
-    """How many are done."""
+    """Number of completed items."""
 
     shown_description = ""
-    """The description that was set last."""
+    """Current description."""
 
     _began, _written_at, _label = 0.0, 0.0, ""
 
     def update(self, n: float | None = 1) -> bool | None:
-        """Count `n` more."""
+        """Add `n` to the count."""
         self.counted += n or 0
         if self._label and time.time() - self._written_at > _WRITE_EVERY_S:
             self._written_at = time.time()
@@ -62,17 +62,17 @@ class Bar(_Tqdm):
 
 @contextmanager
 def progress(total: int | None, doing: str, unit: str, *, quiet: bool) -> Generator[Bar]:
-    """Yield a progress bar on standard error; without a terminal, log lines instead; with `quiet`, neither.
+    """Yield a progress bar on standard error, replaced by log lines without a terminal.
 
     Args:
-        total: how many there are, where that is known.
-        doing: such as "reading".
-        unit: one of them, such as "mesh".
-        quiet: whether to be silent.
+        total: number of items, or None if unknown.
+        doing: action in the present participle, such as "reading".
+        unit: singular noun of the items, such as "mesh".
+        quiet: whether to print neither a bar nor log lines.
     """
     several = unit + ("es" if unit.endswith("sh") else "s")
     label = f"{doing} {several}" if total is None else f"{doing} {total} {unit if total == 1 else several}"
-    # disable=None is tqdm's way to ask whether there is a terminal.
+    # With disable=None, tqdm checks whether there is a terminal.
     with Bar(total=total, desc=doing, unit=unit, leave=False, disable=True if quiet else None) as bar:
         if not quiet:
             bar.write_to_file(label)
@@ -87,7 +87,7 @@ def progress(total: int | None, doing: str, unit: str, *, quiet: bool) -> Genera
 
 @contextmanager
 def steps(total: int | None, doing: str, unit: str, *, quiet: bool) -> Generator[Callable[[int, int], None]]:
-    """Yield what is called with (done, total), and moves a bar of `progress` there."""
+    """Yield a function of (done, total) that updates a bar of `progress`."""
     with progress(total, doing, unit, quiet=quiet) as bar:
 
         def step(done: int, total: int) -> None:
@@ -99,7 +99,7 @@ def steps(total: int | None, doing: str, unit: str, *, quiet: bool) -> Generator
 
 @contextmanager
 def waiting(label: str, *, quiet: bool) -> Generator[None]:
-    """Say on standard error what the user waits for while it cannot be counted, such as "finding the modes"."""
+    """Print the step in progress, such as "finding the modes", on standard error if it cannot be counted."""
     if not quiet:
         _write_progress(label, 0, None, time.time())
     with (
@@ -115,13 +115,13 @@ def _write_progress(label: str, done: float, total: float | None, began: float) 
         return
     state = {"doing": label, "done": done, "total": total, "began": began}
     temporary = Path(f"{file}.{os.getpid()}")
-    with contextlib.suppress(OSError):  # a full disk must not end the work whose progress it is
+    with contextlib.suppress(OSError):  # a full disk must not stop the work
         temporary.write_text(json.dumps(state), encoding="utf-8")
         temporary.replace(file)
 
 
 def telling_of_compiling(*, quiet: bool) -> AbstractContextManager[None]:
-    """Return a block in which a line on standard error says why the user waits while code is compiled."""
+    """Return a context in which a message on standard error reports that code is compiled."""
     if quiet:
         return nullcontext()
     from shapespace.batch.warm import notify_compiling
@@ -135,9 +135,9 @@ def _logging_progress(label: str, state: Callable[[], str], *, quiet: bool) -> G
     """Print lines on standard error while the block runs, first after `FIRST_LOG_LINE_S`, then at growing intervals.
 
     Args:
-        label: the step.
-        state: returns the progress, which is printed after `what`; empty if it is unknown.
-        quiet: whether to be silent.
+        label: name of the step.
+        state: function that returns the progress, which is printed after `label`; empty if unknown.
+        quiet: whether to print nothing.
     """
     if quiet or sys.stderr.isatty():
         yield

@@ -1,4 +1,4 @@
-"""A folder of results: names of the results of scans, the table of all records, and one run at a time that writes."""
+"""A folder of results: names of results, the table of all records, and a lock for one writing run at a time."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from shapespace.schemas import FIT_AGAIN, File, FitRecord
 from shapespace.store.results import results_at
 
 LOCK = ".shapespace.lock"
-"""Is there while a run writes: the system holds the lock, and lets go of it whatever ends the process."""
+"""File that exists while a run writes; the system keeps the lock, and releases it when the process ends."""
 
 
 @contextlib.contextmanager
 def only_writer(folder: Path) -> Generator[None]:
-    """Keep other runs from writing into `folder` during the block, and remove what killed ones left half written.
+    """Keep other runs from writing into `folder` during the block, and remove partial files of killed runs.
 
     Raises:
         FileError: another run writes into it, or it cannot be written.
     """
     path = folder / LOCK
     try:
-        descriptor = _locked(path)
+        descriptor = _open_lock(path)
     except OSError as error:
         raise write_error(path, error) from error
     try:
@@ -42,7 +42,7 @@ def only_writer(folder: Path) -> Generator[None]:
         yield
     finally:
         sweep(folder)
-        # While it is held; Windows alone removes no file that is open.
+        # Before the lock is released; only Windows cannot remove open files.
         if os.name == "nt":
             os.close(descriptor)
         with contextlib.suppress(OSError):
@@ -51,7 +51,7 @@ def only_writer(folder: Path) -> Generator[None]:
             os.close(descriptor)
 
 
-def _locked(path: Path) -> int:
+def _open_lock(path: Path) -> int:
     while True:
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
         try:
@@ -69,7 +69,7 @@ def _locked(path: Path) -> int:
 
 
 def _is_open_as(path: Path, descriptor: int) -> bool:
-    """Return whether `path` is still the file that is open, and not removed by the run that held it."""
+    """Return whether `path` is still the open file, and was not removed by the run that had the lock."""
     try:
         return os.path.samestat(path.stat(), os.fstat(descriptor))
     except FileNotFoundError:
@@ -90,25 +90,25 @@ def records_in(folder: Path, without: Container[str] = ()) -> Iterator[tuple[str
         try:
             yield file.name.removesuffix(RECORD), read_record(file)
         except ShapespaceError:
-            continue  # a report names it
+            continue  # a report lists it
 
 
 _Scan: TypeAlias = tuple[str, str]
-"""Name of the file of a scan, and its path as records of the folder have it; two are the same if these are."""
+"""Key of a scan: its file name, and its path as in records of the folder."""
 
 
 def names_for(
     scans: Sequence[Path], folder: Path | None = None, addresses: Mapping[Path, str] | None = None
 ) -> list[str]:
-    """Return NAME of the result files of each scan: its file name without its ending, where that is free.
+    """Return NAME of the result files of each scan: its file name without its ending, if that is free.
 
-    A scan that has results in `folder` keeps their name. Scans that share a name, with each other or with results of
-    another scan, get as much of their path before it as tells them apart. So no name depends on the order of `scans`.
+    A scan with results in `folder` keeps their name. If scans share a name, with each other or with results of another
+    scan, enough of their path is prepended to distinguish them. Names do not depend on the order of `scans`.
 
     Args:
-        scans: paths; one that is given twice has one name.
-        folder: where results go; None if nothing can be there.
-        addresses: of scans that lie elsewhere, by what their paths would be.
+        scans: paths of the scans; a path that is given twice has one name.
+        folder: folder of the results; None if there are no results.
+        addresses: addresses of remote scans, by their paths in `scans`.
     """
     sources = dict(_sources_in(folder)) if folder is not None else {}
     taken: dict[str, _Scan] = {name: (source.name, source.path) for name, source in sources.items()}
@@ -120,7 +120,7 @@ def names_for(
         if key not in names:
             groups.setdefault(_stem(scan).casefold(), {})[key] = scan
     used = {name.casefold() for name in (*taken, *names.values())}
-    # Names that stand alone come first, so that none is taken from its owner.
+    # Unique names are assigned first, so that no scan loses its name.
     for _, group in sorted(groups.items(), key=lambda item: (len(item[1]) > 1, item[0])):
         (key, scan), *others = group.items()
         stem = _stem(scan)
@@ -134,20 +134,20 @@ def names_for(
 
 
 def _sources_in(folder: Path) -> Iterator[tuple[str, File]]:
-    """Yield NAME of each result in `folder`, of a store too, and the scan in its record."""
+    """Yield NAME of each result in `folder` or its store, and the reference to the scan in its record."""
     if (results := results_at(folder)) is not None:
         for rows in results.iter_rows(_SCAN_COLUMNS):
             for name, scan_name, path, content_hash in zip(*(rows[column] for column in _SCAN_COLUMNS), strict=True):
                 yield name, File(name=scan_name or "", path=path or "", hash=content_hash or "")
     else:
         for file in sorted(folder.glob(f"*{RECORD}")):
-            with contextlib.suppress(ShapespaceError, msgspec.MsgspecError, ValueError):  # a report names it
+            with contextlib.suppress(ShapespaceError, msgspec.MsgspecError, ValueError):  # a report lists it
                 check_file(file, LARGEST_BYTES, FIT_AGAIN)
                 yield file.name.removesuffix(RECORD), msgspec.json.decode(file.read_bytes(), type=_ScanOnly).scan
 
 
 class _ScanOnly(msgspec.Struct, frozen=True):
-    """The scan of a record; the rest is not decoded, which is twenty times as fast."""
+    """Reference to the scan in a record; decoding only this part is twenty times as fast."""
 
     scan: File = File()
 
@@ -161,11 +161,11 @@ def _key(scan: Path, folder: Path | None, address: str) -> _Scan:
 
 
 def _stem(scan: Path) -> str:
-    return _shortened(stem_of(scan) or scan.name)
+    return _shorten(stem_of(scan) or scan.name)
 
 
 def _is_same(scan: Path, source: File | None, folder: Path | None) -> bool:
-    """Return whether results of the same name are of `scan`, which has moved since, or do not say of what they are."""
+    """Return whether results of the same name belong to `scan` at another path, or do not name their scan."""
     if source is None or folder is None:
         return False
     if not source.path:
@@ -188,26 +188,26 @@ def _distinct_names(group: Mapping[_Scan, Path], used: set[str]) -> dict[_Scan, 
         if short and max(counts.values()) == 1 and not counts.keys() & used:
             return names
     return {
-        key: f"{_shortened(stem_of(scan), 180)}_{hashlib.sha256(os.fsencode(scan.resolve())).hexdigest()[:12]}"
+        key: f"{_shorten(stem_of(scan), 180)}_{hashlib.sha256(os.fsencode(scan.resolve())).hexdigest()[:12]}"
         for key, scan in group.items()
     }
 
 
-def _shortened(stem: str, most: int = _LONGEST_NAME) -> str:
-    # File names end at 255 bytes, and the results add theirs.
+def _shorten(stem: str, most: int = _LONGEST_NAME) -> str:
+    # File names are limited to 255 bytes, including the endings of the results.
     content = os.fsencode(stem)
     return stem if len(content) <= most else content[:most].decode("utf-8", "ignore")
 
 
 class CoefficientTable:
-    """coefficients.csv of a folder: a row for each record in it, those of this run last.
+    """coefficients.csv of a folder: a row for each record, those of this run last.
 
-    Those of this run come by `add` and `catch_up`, the others are read at once.
+    Records of this run are added by `add` and `catch_up`; the others are read at the start.
 
     Args:
-        folder: of the results.
-        names: of the results of this run, in order.
-        n_modes: of the model that is fitted; the table has as many coefficients as the largest record at least.
+        folder: folder of the results.
+        names: names of the results of this run, in order.
+        n_modes: number of modes of the model; the table has at least as many coefficients as the largest record.
     """
 
     def __init__(self, folder: Path, names: Sequence[str], n_modes: int) -> None:
@@ -220,12 +220,12 @@ class CoefficientTable:
             self._add_earlier(name, record)
 
     def add(self, name: str, record: FitRecord) -> None:
-        """Put in the row of a record, in place of an earlier one of that name."""
+        """Add the row of a record, which replaces an earlier row of that name."""
         self._rows[name] = coefficient_row(name, record)
         self._n_modes = max(self._n_modes, len(record.b))
 
     def catch_up(self, names: Sequence[str]) -> None:
-        """Put in the records of `names` that are there: of earlier runs, or written by workers that were stopped."""
+        """Add the existing records of `names`, of earlier runs or written by workers that were stopped."""
         for name in names:
             with contextlib.suppress(ShapespaceError):  # never written
                 self._add_earlier(name, read_record(self._folder / f"{name}{RECORD}"))
@@ -244,4 +244,4 @@ class CoefficientTable:
         try:
             self.add(name, record)
         except ValueError:
-            self._rows.pop(name, None)  # damaged; a report names it
+            self._rows.pop(name, None)  # damaged; a report lists it

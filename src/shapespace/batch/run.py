@@ -1,8 +1,7 @@
-"""Fit many scans: a scan that cannot be fitted becomes a failed record, and an interruption loses no finished fit.
+"""Fits of many scans: a scan that cannot be fitted results in a failed record, and interruptions lose no finished fit.
 
-Results go to a sink: single files in a folder, or a store. It finds the results of earlier runs that are still valid,
-takes each record as it comes, and leaves a complete folder however the run ends. `fit_many` holds the lock of the
-folder while the sink is in use.
+Results are written to a sink: single files in a folder, or a store. It finds valid results of earlier runs, accepts
+each record, and completes the folder also after an interruption. `fit_many` locks the folder while the sink is in use.
 """
 
 from __future__ import annotations
@@ -30,12 +29,12 @@ from shapespace.schemas import File, FitRecord
 from shapespace.store.results import Results
 
 STORE_FROM = 10_000
-"""Number of scans from which on a store is the default."""
+"""Number of scans from which a store is the default."""
 ROWS = 1000
 """Number of fits that are moved into a store at a time."""
-_SAVE_INTERVAL_S = 5.0  # seconds; least time between two saves of the tables
+_SAVE_INTERVAL_S = 5.0  # seconds; shortest time between two saves of the tables
 _SAVE_COST_RATIO = 20.0
-"""The next save of the table is at least this many times as far away as the last one took."""
+"""Smallest ratio of the time until the next save of the table to the duration of the last one."""
 _SCAN = {
     "path": "path",
     "hash": "scan_hash",
@@ -52,8 +51,8 @@ class FolderSink:
     """Single files, and coefficients.csv with the records of all runs, those of this run last.
 
     Args:
-        folder: of the results.
-        records: of this run by the names of the jobs, also of valid earlier results.
+        folder: folder of the results.
+        records: records of this run by the names of the jobs, including those of valid earlier results.
     """
 
     folder: Path
@@ -63,8 +62,8 @@ class FolderSink:
         """Read the results of earlier runs.
 
         Args:
-            names: of the jobs of this run.
-            model: that is fitted.
+            names: names of the jobs of this run.
+            model: model of the fits.
             reuse: whether valid earlier results are reused.
         """
         self._reuse, self._model_hash, self._started = reuse, model.content_hash, tuple[str, ...]()
@@ -94,7 +93,7 @@ class FolderSink:
         self._table.catch_up(names)
 
     def add(self, name: str, record: FitRecord) -> None:
-        """Take the record of a job, whose files are written; the table is saved at intervals."""
+        """Add the record of a job, whose files are already written; the table is saved at intervals."""
         self._table.add(name, record)
         self.records[name] = record
         if (now := time.monotonic()) > self._next_save:
@@ -102,7 +101,7 @@ class FolderSink:
             self._next_save = time.monotonic() + max(_SAVE_INTERVAL_S, _SAVE_COST_RATIO * (time.monotonic() - now))
 
     def close(self) -> None:
-        """Leave the folder complete, also with results that were written and not added, after an interruption."""
+        """Complete the folder, also after an interruption, with results that were written but not added."""
         self._table.catch_up([name for name in self._started if name not in self.records])
         self._table.save()
 
@@ -115,15 +114,15 @@ class FolderSink:
 
 
 _Stored: TypeAlias = tuple[FitRecord, bool]
-"""A fit in a store: of its record id, status and scan alone, and whether its stages are kept."""
+"""A fit in a store: id, status and scan of its record, and whether it has stages."""
 
 
 @dataclass
 class StoreSink:
-    """A store, into which finished results are moved `ROWS` at a time; no records are held in memory.
+    """A store, into which finished results are moved `ROWS` at a time; records are not kept in memory.
 
     Args:
-        folder: of the store.
+        folder: folder of the store.
     """
 
     folder: Path
@@ -133,8 +132,8 @@ class StoreSink:
         """Read the results of earlier runs.
 
         Args:
-            names: of the jobs of this run.
-            model: that is fitted.
+            names: names of the jobs of this run.
+            model: model of the fits.
             reuse: whether valid earlier results are reused.
 
         Raises:
@@ -161,14 +160,14 @@ class StoreSink:
         self._stored.clear()
 
     def add(self, name: str, record: FitRecord) -> None:
-        """Take the record of a job, whose files are written."""
+        """Add the record of a job, whose files are already written."""
         self._finished.append(name)
         if len(self._finished) >= ROWS:
             self._store.compact(self._finished)
             self._finished.clear()
 
     def close(self) -> None:
-        """Leave the folder complete, also with results that were written and not added, after an interruption."""
+        """Complete the folder, also after an interruption, with results that were written but not added."""
         self._store.compact()
 
     def _read_stored(self) -> Iterator[tuple[str, _Stored]]:
@@ -178,7 +177,7 @@ class StoreSink:
                 yield name, (FitRecord(id=identity or "", status=status, scan=File(**known)), bool(stages))
 
     def _is_valid(self, stored: _Stored, task: FitTask) -> bool:
-        """Return whether a stored fit has what the task asks for, or more: a dense surface, or stages."""
+        """Return whether a stored fit is valid and has at least the requested dense surface and stages."""
         record, staged = stored
         if not record.is_fitted or (task.stages and not staged):
             return False
@@ -192,7 +191,7 @@ class StoreSink:
 
 
 Sink: TypeAlias = FolderSink | StoreSink
-"""Takes the results of a batch of fits; used once."""
+"""Destination of the results of a batch of fits, for one use."""
 
 
 def make_jobs(
@@ -201,7 +200,7 @@ def make_jobs(
     folder: Path | None = None,
     addresses: Mapping[Path, str] | None = None,
 ) -> list[Job]:
-    """Return one job a scan, named by `names_for` for results in `folder`; a scan given twice is one job twice."""
+    """Return a job for each scan, named by `names_for` for results in `folder`; equal scans have equal jobs."""
     addresses = addresses or {}
     names = names_for(scans, folder, addresses)
     return [
@@ -214,9 +213,9 @@ class Plan:
     """Numbers of fits in a run.
 
     Args:
-        valid: scans whose results of an earlier run are valid.
-        repeated: scans with results that are not valid any more.
-        new: scans without results.
+        valid: number of scans with valid results of an earlier run.
+        repeated: number of scans whose results are no longer valid.
+        new: number of scans without results.
     """
 
     valid: int
@@ -224,7 +223,7 @@ class Plan:
     new: int
 
     def sentences(self) -> Iterator[str]:
-        """Yield what a user should know of it."""
+        """Yield sentences for the user about reused and repeated fits."""
         total = self.valid + self.repeated + self.new
         if self.valid:
             noun = "scan has a valid result, which is" if self.valid == 1 else "scans have valid results, which are"
@@ -242,12 +241,12 @@ class BatchConfig:
     """What the fits of a batch have in common.
 
     Args:
-        model: the shape space.
-        model_file: where the model was read from, for the records and for workers.
+        model: shape model of the fits.
+        model_file: path of the model, for the records and for workers.
         fit: settings of each fit.
-        stages: also write the surfaces at each stage, for figures.
-        reuse: reuse earlier results that are valid for the same scan, model and settings. Where such a fit has to be
-            done again, for the stages say, it keeps the dense surface and the stages that it had.
+        stages: whether to write the surfaces at each stage, for figures.
+        reuse: whether to reuse earlier results that are valid for the same scan, model and settings. If such a fit is
+            repeated, for example to write its stages, its dense surface and stages are kept.
         first: names of jobs that are done before the others.
     """
 
@@ -272,13 +271,15 @@ def fit_many(
     """Fit all `jobs` into `sink` and return the number of fits of each status; an interruption loses no finished fit.
 
     Args:
-        jobs: the scans; those with the same name are fitted once.
-        config: what the fits have in common.
-        executor: see `batch.executors`.
-        sink: where results go, see `Sink`; its folder is made if absent, and no other run may write into it.
-        on_plan: called once with the numbers of valid, repeated and new fits.
-        on_done: called with each job and its record; the record of a valid result in a store has no `reason`.
-        on_state: called with each state of the loop by the serial executor.
+        jobs: jobs of the scans; jobs with the same name are done once.
+        config: common settings of the fits.
+        executor: executor of the fits, see `batch.executors`.
+        sink: destination of the results, see `Sink`; its folder is created if missing, and no other run may write into
+            it.
+        on_plan: function that is called once with the numbers of valid, repeated and new fits.
+        on_done: function that is called with each job and its record; the record of a valid result in a store has no
+            `reason`.
+        on_state: function that the serial executor calls with each state of the iteration.
 
     Raises:
         FileError: the results cannot be written, or another run writes into the folder.

@@ -1,4 +1,4 @@
-"""Single results into the shards of a store: first the shard, then the manifest, and only then the single files go."""
+"""Transfer of single results into the shards of a store: shard, manifest, then removal of the single files."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ from shapespace.store.shard import KINDS, ROW, Shard, is_plain_name
 from shapespace.types import Mesh
 
 ROWS = 1000
-"""Fits in a shard, if not said otherwise."""
+"""Default number of fits in a shard."""
 
-_ROW_GROUP = 250  # rows; readers load whole groups, and 250 wide rows take a few MB
+_ROW_GROUP = 250  # rows; readers load complete groups, and 250 wide rows take a few MB
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,8 @@ class Compacted:
     """Result of moving single results into a store.
 
     Args:
-        moved: names that are in a shard now.
-        left: name -> why it stays as single files.
+        moved: names of the results that were moved into a shard.
+        left: name -> reason why a result remains in single files.
     """
 
     moved: list[str] = field(default_factory=list[str])
@@ -60,7 +60,7 @@ class Compacted:
 
 @dataclass(frozen=True, eq=False)
 class _Result:
-    """A single result, read and found whole; its surfaces are read again when they are written."""
+    """A single result after the check of its files; its surfaces are read again for writing."""
 
     name: str
     text: str
@@ -72,11 +72,11 @@ class _Result:
 class Store:
     """Results of fits in a folder, moved from single files into shards.
 
-    Whoever moves holds the lock of the folder: two may not do it at a time. Killed at any moment, nothing is lost and
-    nothing counted twice, and the next call finishes what was begun.
+    The caller must have the lock of the folder, since only one process may move results at a time. If it is killed, no
+    result is lost or counted twice, and the next call completes the transfer.
 
     Args:
-        folder: of the results.
+        folder: folder of the results.
 
     Raises:
         ShapespaceError: the extra `store` is not installed.
@@ -87,7 +87,7 @@ class Store:
         self.folder = folder
 
     def identities(self) -> dict[str, str]:
-        """Return name -> identity of the fits that are in readable shards.
+        """Return name -> identity of the fits in readable shards.
 
         Raises:
             FileFormatError: the manifest is damaged.
@@ -96,13 +96,13 @@ class Store:
         return {} if manifest is None else reading.ResultStore(self.folder, manifest).identities()
 
     def finish(self) -> list[str]:
-        """Finish what a killed run began: remove files that no manifest names, and single files that a shard holds.
+        """Complete the transfer of a killed run: remove files that the manifest does not list, and moved single files.
 
         Returns:
-            The names whose single files were removed.
+            The names of the results whose single files were removed.
 
         Raises:
-            FileError: something cannot be removed.
+            FileError: a file cannot be removed.
             FileFormatError: the manifest is damaged.
         """
         sweep(self.folder)
@@ -117,7 +117,7 @@ class Store:
         return done
 
     def _remove_unnamed(self, manifest: Manifest, results: Results) -> None:
-        """Remove files that the manifest does not name; a table only if each fit in it is elsewhere too."""
+        """Remove files that are not in the manifest; a table only if other files contain each of its fits."""
         named = {file.file for shard in manifest.shards for file in shard.files}
         unknown: set[str] = set()
         for part in PARTS:
@@ -133,27 +133,27 @@ class Store:
                     remove_file(path)
         if unknown:
             raise FileFormatError(
-                f"{self.folder / Manifest.FILE} does not name {TABLE}/{min(unknown)}{PARTS[TABLE]}, which holds fits "
-                "that are nowhere else; copy the manifest again, or move that file away."
+                f"{self.folder / Manifest.FILE} does not list {TABLE}/{min(unknown)}{PARTS[TABLE]}, which contains "
+                "fits that are in no other file; copy the manifest again, or move that file away."
             )
 
     def compact(self, names: Iterable[str] | None = None, *, rows: int = ROWS) -> Compacted:
         """Move finished single results into new shards.
 
-        A result that cannot be moved as it is, such as one without its surface, stays, with the reason in `left`. A fit
-        that was in a shard already is replaced there.
+        A result that cannot be moved, such as a result without its surface, remains, with the reason in `left`. A fit
+        that is already in a shard is replaced there.
 
         Args:
-            names: of the results; None for all single ones.
-            rows: in a shard at most.
+            names: names of the results; None for all single results.
+            rows: largest number of fits in a shard.
 
         Raises:
-            FileError: something cannot be read or written, or the disk is full; everything is as it was, or moved.
+            FileError: a file cannot be read or written, or the disk is full; each result is unchanged or moved.
             FileFormatError: the manifest is damaged.
         """
         self.finish()
         if read_manifest(self.folder) is None:
-            # First of all, so that shards without a manifest are always those of a lost one.
+            # Written first, so that shards without a manifest always indicate a lost manifest.
             self._write_manifest(Manifest())
         results = Results(self.folder)
         singles, stored = results.files, self.identities().keys() if results.files else ()
@@ -170,7 +170,7 @@ class Store:
                     out.left[name] = f"The record of {name} is damaged; fit the scan again."
                 else:
                     groups.setdefault(result.topology, []).append(result)
-            # Fits without a surface go with those that have one.
+            # Fits without a surface are added to a group with surfaces.
             if len(groups) > 1 and (bare := groups.pop("", None)):
                 next(iter(groups.values())).extend(bare)
             rank = {name: k for k, name in enumerate(wanted)}
@@ -186,21 +186,21 @@ class Store:
         _to_disk(self.folder)
 
     def _remove_singles(self, name: str) -> None:
-        # The record goes last: what lies beside it is never without it.
+        # The record is removed last, so that the other files are never without it.
         landmarks = FIDUCIAL_ENDINGS if reading.has_written_landmarks(self.folder / f"{name}{ENDING}") else ()
         for ending in (*ENDINGS.values(), *landmarks, ENDING):
             remove_file(self.folder / f"{name}{ending}")
 
     def _read(self, name: str, parts: frozenset[str]) -> _Result:
-        """Return a single result, or raise what keeps it from being moved."""
+        """Return a single result, or raise an error with the reason why it cannot be moved."""
         if not is_plain_name(name):
-            raise ShapespaceError(f"{name[:80]!r} is no name that a store can hold; rename the scan.")
+            raise ShapespaceError(f"{name[:80]!r} is not a valid name in a store; rename the scan.")
         path = self.folder / f"{name}{ENDING}"
         text = path.read_bytes().decode("utf-8")
         record = FitRecord.from_json(json.loads(text), str(path))
         fitted = record.is_fitted
         if fitted and "fitted" not in parts:
-            raise ShapespaceError(f"{path} has no surface beside it; fit the scan again.")
+            raise ShapespaceError(f"{path} has no surface in its folder; fit the scan again.")
         kinds = tuple(kind for kind in ENDINGS if fitted and kind in parts)
         row = store_row(name, record) | {kind: kind in kinds for kind in FLAGS}
         topologies = {_topology(self._surface(name, kind)) for kind in KINDS if kind in kinds}
@@ -225,7 +225,7 @@ class Store:
             **_summary(rows),
         )
         older = {result.name for result in group if result.name in stored}
-        remaining = [self._without(shard, older) if older else shard for shard in manifest.shards]
+        remaining = [self._remove_rows(shard, older) if older else shard for shard in manifest.shards]
         shards = (*(shard for shard in remaining if shard is not None), new)
         self._write_manifest(Manifest(shards=shards))
         for result in group:
@@ -234,8 +234,8 @@ class Store:
         for file in gone - {file.file for shard in shards for file in shard.files}:
             remove_file(self.folder / file)
 
-    def _without(self, entry: ShardEntry, names: set[str]) -> ShardEntry | None:
-        """Return a shard without the rows of `names`, None where that leaves none; a damaged one stays as it is."""
+    def _remove_rows(self, entry: ShardEntry, names: set[str]) -> ShardEntry | None:
+        """Return a shard without the rows of `names`, or None if no row remains; a damaged shard is unchanged."""
         if not any(entry.first <= name <= entry.last for name in names):
             return entry
         shard = Shard(self.folder, entry)
@@ -254,7 +254,7 @@ class Store:
         return replaced(entry, table=self._write_table(stem, rows, columns), **_summary(rows))
 
     def _columns_of(self, manifest: Manifest) -> Iterable[str]:
-        """Return the columns of the last shard that can be read: who reads all tables needs the same in each."""
+        """Return the columns of the last readable shard, since all tables must have the same columns."""
         for entry in reversed(manifest.shards):
             with contextlib.suppress(ShapespaceError):
                 return Shard(self.folder, entry).column_names()
@@ -265,7 +265,7 @@ class Store:
         kinds: dict[str, Any] = {"text": pa.string(), "count": pa.int64(), "flag": pa.bool_(), "number": pa.float64()}
         modes = max(row.get("modes") or 0 for row in rows)
         every = {column for row in rows for column in row}
-        columns = _ordered(every.union(also, coefficient_columns(modes), TEXTS) - {CHECKSUM})
+        columns = _sort_columns(every.union(also, coefficient_columns(modes), TEXTS) - {CHECKSUM})
         types: dict[str, Any] = {column: kinds["count" if column == ROW else kind_of(column)] for column in columns}
         table: Any = pa.table({
             column: pa.array([row.get(column) for row in rows], type=kind) for column, kind in types.items()
@@ -278,7 +278,7 @@ class Store:
                 write_statistics=["scan"], write_page_checksum=True,
             )  # fmt: skip
 
-        return self._written(TABLE, stem, write)
+        return self._write_part(TABLE, stem, write)
 
     def _write_surfaces(self, stem: str, group: Sequence[_Result]) -> StoredFile | None:
         if not group:
@@ -316,7 +316,7 @@ class Store:
                                 colours[k] = surface.colours
                     array(f"{kind}_origin", origins.shape, "<f8", origins.shape)[:] = origins
 
-        return self._written(SURFACES, stem, write)
+        return self._write_part(SURFACES, stem, write)
 
     def _write_stages(self, stem: str, names: Sequence[str]) -> StoredFile | None:
         if not names:
@@ -327,9 +327,9 @@ class Store:
                 for name in names:
                     archive.write(self.folder / f"{name}{ENDINGS['stages']}", f"{name}{ENDINGS['stages']}")
 
-        return self._written(STAGES, stem, write)
+        return self._write_part(STAGES, stem, write)
 
-    def _written(self, part: str, stem: str, write: Any) -> StoredFile:
+    def _write_part(self, part: str, stem: str, write: Any) -> StoredFile:
         path = make_folder(self.folder / part) / f"{stem}{PARTS[part]}"
         with atomic_path(path) as temporary:
             write(temporary)
@@ -342,7 +342,7 @@ class Store:
 
 
 def _names_in(table: Path) -> set[str]:
-    """Return the names of the fits in a table; a name that no fit has if it cannot be read."""
+    """Return the names of the fits in a table; if it cannot be read, a name that no fit has."""
     try:
         return {str(name) for name in arrow(".parquet").read_table(table, columns=["scan"]).column("scan").to_pylist()}
     except (OSError, ValueError, KeyError):
@@ -350,7 +350,7 @@ def _names_in(table: Path) -> set[str]:
 
 
 def _end_of_table(path: Path) -> bytes:
-    """Return the end of a Parquet file: its schema, where its pages are, how long that is, and PAR1."""
+    """Return the footer of a Parquet file: its schema, the positions of its pages, the footer length, and PAR1."""
     with path.open("rb") as stream:
         stream.seek(-8, os.SEEK_END)
         length = int.from_bytes(stream.read(4), "little")
@@ -359,7 +359,7 @@ def _end_of_table(path: Path) -> bytes:
 
 
 def _to_disk(path: Path) -> None:
-    """Wait until a file, or what a folder says of its files, is on the disk: single files are deleted after it."""
+    """Wait until a file, or the entries of a folder, are on the disk, because single files are removed afterwards."""
     if path.is_dir() and os.name == "nt":
         return
     try:
@@ -378,25 +378,25 @@ def _summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {"rows": len(rows), "counts": counts, "first": min(names), "last": max(names)}
 
 
-def _ordered(columns: set[str]) -> list[str]:
-    """Return columns in the order of the table: what a fit is, its metadata, its numbers, its record last."""
+def _sort_columns(columns: set[str]) -> list[str]:
+    """Return columns in the order of the table: identification of a fit, metadata, numbers, and its record."""
     lead = [column for column in TEXTS if column in columns and column != RECORD]
     metas = sorted(column for column in columns if column.startswith(META))
-    rest = sorted(columns.difference(lead, metas, (RECORD, ROW, *FLAGS)), key=_natural)
+    rest = sorted(columns.difference(lead, metas, (RECORD, ROW, *FLAGS)), key=_natural_key)
     return [*lead, *metas, *rest, *FLAGS, ROW, RECORD]
 
 
-def _natural(column: str) -> tuple[str, int, str]:
+def _natural_key(column: str) -> tuple[str, int, str]:
     """Return a key that sorts b2 before b10."""
     letter, number = column[:1], column[1:].removesuffix("_stddev").removesuffix("_rms_mm")
     return (f"{letter}{column.removeprefix(letter + number)}", int(number), "") if number.isdigit() else (column, 0, "")
 
 
 def _topology(mesh: Mesh) -> str:
-    """Return a key that two meshes share if their vertices and triangles correspond; raise if they cannot be held."""
+    """Return a key of the number of vertices and the triangles of a mesh; raise if a store cannot contain the mesh."""
     vertices = mesh.vertices
     if not len(vertices) or not np.isfinite(vertices).all():
-        raise ShapespaceError(f"{mesh.name} has no vertices, or some that are no points; fit the scan again.")
+        raise ShapespaceError(f"{mesh.name} has no vertices, or vertices that are not finite; fit the scan again.")
     with np.errstate(over="ignore"):
         farthest = np.abs(vertices - _middle(vertices)).max()
     if farthest > np.finfo(np.float32).max:
@@ -406,6 +406,6 @@ def _topology(mesh: Mesh) -> str:
 
 
 def _middle(vertices: Any) -> Any:
-    """Return the middle of the box around `vertices` (V, 3): offsets from there are the smallest."""
+    """Return the centre of the box around `vertices` (V, 3), from which offsets are smallest."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     return low / 2 + high / 2

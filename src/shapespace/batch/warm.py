@@ -1,7 +1,7 @@
-"""Loads the code of a fit, or compiles it on a machine that has none yet.
+"""Warm-up: loads the code of a fit, or compiles it on a machine without compiled code.
 
-A small fit does it, since machine code is made for the arrays that it meets. The server of `workers` does it when it
-imports this module.
+It runs small fits, since code is compiled for the types of arrays that it processes. The server of `workers` runs them
+when it imports this module.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def notify_compiling() -> None:
 
 
 def warm_up(*, notify: bool) -> None:
-    """Fit a small model to small surfaces and to points, from no start; with `notify` print a line if that compiles."""
+    """Fit a small model to small surfaces and points without a start pose; with `notify`, report compilation."""
     with notify_compilation(notify_compiling if notify else lambda: None):
         _small_fits()
 
@@ -44,7 +44,7 @@ def _small_fits() -> None:
     hill = _hill(45, 9)
     half = part_of(hill, hill.vertices[:, 0] < 0)
     for raw in (upside_down, hill, Mesh(hill.vertices), half):
-        # So small a scan may be refused, and says nothing of those to come.
+        # Such a small scan may be rejected, which does not matter here.
         with contextlib.suppress(ShapespaceError):
             _ = fit_scan(model, raw, FitConfig(max_iterations=20)).distances
     residual_modes(model, ResidualSettings(count=5))
@@ -62,6 +62,6 @@ def _hill(side: int, seed: int) -> Mesh:
 
 
 if how := os.environ.get(WARM_UP):
-    # In the server of `workers` alone, so that its copies are warm. The fits to come report what fails.
+    # Only in the server of `workers`, so that its copies are warm. Later fits report errors.
     with contextlib.suppress(Exception):
         warm_up(notify=how == "notify")

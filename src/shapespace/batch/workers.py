@@ -1,8 +1,8 @@
-"""Worker processes: one server loads the code once, each worker is a copy of it, and a team of workers does many tasks.
+"""Worker processes: a server loads the code once, workers are copies of the server, and a team does many tasks.
 
-This module imports nothing heavy, so that the server can start before the rest of the program is loaded.
+This module has no slow imports, so that the server can start before the rest of the program is loaded.
 
-The processes of a command print some messages only once together: that code is being compiled.
+Of all processes of a command, only one prints the message that code is being compiled.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ TaskT = TypeVar("TaskT", contravariant=True)
 AnswerT = TypeVar("AnswerT", covariant=True)
 
 ATTEMPTS = 2
-"""Number of workers that a task may cost before it is given up."""
+"""Number of workers that may crash on a task before it is given up."""
 GRACE_S = 5.0
-"""Time for running tasks to end when a run is stopped; a second Ctrl-C ends them at once."""
-_STARTS = 3  # worker pools in a row that may fail to start: one failure can be chance, three are the machine
+"""Time for running tasks to end when a run is stopped, s; a second Ctrl-C ends these at once."""
+_STARTS = 3  # consecutive failures to start workers: one may be chance, three are a problem of the machine
 _FOREVER = float("inf")
 _NO_START = (
-    "Worker processes end as they start; use --jobs 1, free some memory, or, in a script of your own, put what it does "
+    "Worker processes end at their start; use --jobs 1, free some memory, or, in a script, move its main code "
     'under if __name__ == "__main__".'
 )
 
 MARK = "SHAPESPACE_MESSAGE_MARK"
-"""Environment variable of the server of the workers alone: a folder that the first process to print creates."""
+"""Environment variable of the server of the workers: path of a folder that the first printing process creates."""
 
 
 class _Mark:
@@ -50,7 +50,7 @@ class _Mark:
 
 
 def share_mark() -> str:
-    """Return the mark that this process shares with the server that it starts."""
+    """Return the path of the mark that this process shares with its server."""
     if not _Mark.path:
         folder = Path(tempfile.mkdtemp(prefix="shapespace-"))
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
@@ -59,20 +59,20 @@ def share_mark() -> str:
 
 
 def remove_mark() -> str:
-    """Let this process print whatever others print; return that it has no mark."""
+    """Let this process print independently of others, and return an empty mark."""
     _Mark.path = ""
     return ""
 
 
 def is_first() -> bool:
-    """Return whether this process is the first to print, of those that share its mark; the next call returns False."""
+    """Return whether this process is the first to print among those with its mark; the next call returns False."""
     if not _Mark.path:
         return True
     try:
         Path(_Mark.path).mkdir()
     except FileExistsError:
         return False
-    except OSError:  # the folder is gone, or cannot be written: better twice than never
+    except OSError:  # the folder was removed or is read-only: print twice rather than never
         return True
     return True
 
@@ -82,25 +82,25 @@ if TYPE_CHECKING:
     from multiprocessing.context import ForkServerContext, SpawnContext
 
 WARM_UP = "SHAPESPACE_WARM_UP"
-"""Set for the server alone: `notify` if it may print on standard error that it compiles, else `quiet`."""
+"""Environment variable of the server: `notify` if it may report compilation on standard error, else `quiet`."""
 COPIED = sys.platform == "linux"
-"""Whether workers are copies of one server. Apple's BLAS does not survive a fork, and Windows has none."""
+"""Whether workers are copies of one server. Apple's BLAS does not support fork, and Windows has no fork."""
 _WARM = "shapespace.batch.warm"  # loads the code of a fit; imports this module
 _BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def cores() -> int:
-    """Return how many cores this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 def context() -> ForkServerContext | SpawnContext:
-    """Return how workers start: as copies of a warm server on Linux, from nothing where copies are not safe."""
+    """Return the start method of workers: copies of a warm server on Linux, new processes elsewhere."""
     return multiprocessing.get_context("forkserver") if COPIED else multiprocessing.get_context("spawn")
 
 
 def start_loading(*, notify: bool) -> None:
-    """Load the code of the workers in the background; where they start from nothing, see that it is compiled.
+    """Load the code of the workers in the background; for workers that are new processes, compile it if needed.
 
     Args:
         notify: whether a line on standard error may state that the code is being compiled.
@@ -113,17 +113,17 @@ def start_loading(*, notify: bool) -> None:
 
 
 def preload(modules: Sequence[str], environment: Mapping[str, str] | None = None) -> None:
-    """Import `modules` in the background for workers that are copies; do nothing where they start from nothing.
+    """Import `modules` in the background for workers that are copies of a server; do nothing for other workers.
 
     Args:
-        modules: names.
-        environment: variables of the server alone.
+        modules: names of the modules.
+        environment: environment variables of the server only.
     """
     if not COPIED:
         return
     from multiprocessing import forkserver  # not on Windows
 
-    # One worker is one core: threads of BLAS would spread it over all.
+    # One worker uses one core; threads of BLAS would use all cores.
     wanted = dict.fromkeys(_BLAS_THREADS, "1") | dict(environment or {})
     before = {name: os.environ.get(name) for name in wanted}
     os.environ.update(wanted)
@@ -140,7 +140,7 @@ def preload(modules: Sequence[str], environment: Mapping[str, str] | None = None
 
 
 def wait_until_loaded() -> None:
-    """Return when workers start at once; Ctrl-C is heard until then.
+    """Wait until workers can start without delay; Ctrl-C interrupts the wait.
 
     Raises:
         FitError: no process can be started.
@@ -148,25 +148,25 @@ def wait_until_loaded() -> None:
     if not COPIED:
         return
     try:
-        first = context().Process(target=_nothing)
+        first = context().Process(target=_do_nothing)
         with _children_allowed():
             first.start()
         first.join()
     except (EOFError, OSError) as error:
-        raise FitError("The system does not let worker processes start; fit with --jobs 1.") from error
+        raise FitError("The system cannot start worker processes; fit with --jobs 1.") from error
 
 
-def _nothing() -> None:
+def _do_nothing() -> None:
     pass
 
 
 class Worker:
-    """A process that receives one task after the other through a pipe of its own.
+    """A process that receives one task after the other through its own pipe.
 
     Args:
-        serve: the function it runs, called with its end of the pipe and `arguments`; it sends `()` when it is ready.
-        arguments: of `serve`.
-        life: of `life_line`; the process ends with it, whatever it does.
+        serve: function of the process, called with its end of the pipe and `arguments`; it sends `()` when it is ready.
+        arguments: further arguments of `serve`.
+        life: connection from `life_line`; the process ends when it is closed.
 
     Raises:
         FitError: no process can be started.
@@ -174,29 +174,29 @@ class Worker:
 
     def __init__(self, serve: Callable[..., None], arguments: tuple[Any, ...], life: Connection) -> None:
         self.line, theirs = context().Pipe()
-        self._process = context().Process(target=_live, args=(serve, theirs, life, arguments), daemon=True)
+        self._process = context().Process(target=_run_worker, args=(serve, theirs, life, arguments), daemon=True)
         try:
             with interrupts_ignored(), _children_allowed():
                 self._process.start()
         except (EOFError, OSError) as error:
-            raise FitError("The system does not let worker processes start; use --jobs 1.") from error
+            raise FitError("The system cannot start worker processes; use --jobs 1.") from error
         finally:
             theirs.close()
 
     def give(self, task: object) -> None:
-        """Send a task; if the worker has died meanwhile, `answer` returns None."""
+        """Send a task; if the worker has crashed, `answer` returns None."""
         with contextlib.suppress(OSError):
             self.line.send(task)
 
     def answer(self) -> Any:
-        """Return the tuple that it sent, `()` when it is ready, or None if none has arrived or can arrive."""
+        """Return the tuple that the worker sent, `()` if it is ready, or None if nothing has arrived or can arrive."""
         try:
             return self.line.recv() if self.line.poll() else None
         except (EOFError, OSError):
             return None
 
     def stop(self) -> int:
-        """End it at once where it has not ended, and return its exit code, below 0 for a signal."""
+        """End the worker at once if it is running, and return its exit code, negative for a signal."""
         self._process.kill()
         self._process.join()
         self.line.close()
@@ -207,7 +207,7 @@ class Worker:
 
 @contextlib.contextmanager
 def life_line() -> Generator[Connection]:
-    """Yield what ends with this block, and with this process whatever ends that: nobody else holds its other end."""
+    """Yield a connection that closes at the end of this block or process, since no other process has its other end."""
     life, ours = context().Pipe(duplex=False)
     try:
         yield life
@@ -218,7 +218,7 @@ def life_line() -> Generator[Connection]:
 
 @contextlib.contextmanager
 def _children_allowed() -> Generator[None]:
-    """Let workers of Dask, which are daemons, have children too: the life line ends those with them."""
+    """Allow workers of Dask, which are daemons, to have children; the life line ends the children with their parent."""
     config: dict[str, Any] = cast(Any, multiprocessing.current_process())._config
     daemon = config.pop("daemon", None)
     try:
@@ -229,7 +229,7 @@ def _children_allowed() -> Generator[None]:
 
 
 def end_after(wait: Callable[[], object]) -> None:
-    """End this process when `wait`, which waits for the end of its parent, returns."""
+    """End this process when `wait` returns, which waits for the end of the parent process."""
 
     def end() -> None:
         wait()
@@ -238,14 +238,14 @@ def end_after(wait: Callable[[], object]) -> None:
     threading.Thread(target=end, daemon=True).start()
 
 
-def _live(serve: Callable[..., None], line: Connection, life: Connection, arguments: tuple[Any, ...]) -> None:
+def _run_worker(serve: Callable[..., None], line: Connection, life: Connection, arguments: tuple[Any, ...]) -> None:
     end_after(lambda: life.poll(None))
     serve(line, *arguments)
 
 
 @contextlib.contextmanager
 def interrupts_ignored() -> Generator[None]:
-    """Let processes that start in this block inherit deafness to Ctrl-C: stopping them is the parent's job."""
+    """Let processes that start in this block ignore Ctrl-C, because the parent process stops them."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -257,9 +257,9 @@ def interrupts_ignored() -> Generator[None]:
 
 
 class Work(Protocol[TaskT, AnswerT]):
-    """What is done with each task: frozen, small, and sent to every worker.
+    """Function of each task and its data: frozen, small, and sent to every worker.
 
-    It names the data that the tasks share by path or hash; `do` loads them once in each process (`Shared`,
+    It refers to shared data of the tasks by path or hash; `do` loads these data once in each process (`Shared`,
     `LatestValue`).
     """
 
@@ -267,7 +267,7 @@ class Work(Protocol[TaskT, AnswerT]):
         """Do one task; an error of the task itself is part of the answer.
 
         Raises:
-            ShapespaceError: an error that would stop every other task too, such as a full disk.
+            ShapespaceError: an error that also affects all other tasks, such as a full disk.
         """
         ...
 
@@ -278,19 +278,19 @@ class Work(Protocol[TaskT, AnswerT]):
 
 @dataclass
 class _Assignment:
-    """The task of a worker by its number, None while it starts or waits for one, and when it must have ended."""
+    """Number of the task of a worker, None while it starts or waits for a task, and the deadline of the task."""
 
     number: int | None = None
     deadline: float = _FOREVER
 
 
 class Team:
-    """Worker processes that are started when needed and stay for further tasks; each has a pipe of its own.
+    """Worker processes that are started when needed and reused for further tasks; each has its own pipe.
 
     Args:
-        work: what they do.
+        work: function of each task and its data.
         size: largest number of workers.
-        timeout_s: a task that takes longer is given up; None for no limit.
+        timeout_s: time limit of a task, s, after which it is given up; None for no limit.
         quiet: whether the first worker does not report that code is compiled.
 
     Raises:
@@ -320,7 +320,7 @@ class Team:
                 self._assign(self._idle.pop(), waiting.popleft(), tasks)
             while len(self._assignments) + len(self._idle) < min(self._size, left):
                 self._assignments[Worker(_serve, (self._work,), self._life)] = _Assignment()
-            for worker in self._ready():
+            for worker in self._wait_for_workers():
                 assignment = self._assignments.pop(worker)
                 number, answer = assignment.number, worker.answer()
                 if answer is not None:
@@ -347,10 +347,10 @@ class Team:
                 yield number, self._work.give_up(tasks[number], _reason_of_death(code, late_s))
 
     def close(self) -> None:
-        """Give running tasks a moment to end, then end every worker."""
+        """Wait up to `GRACE_S` for running tasks, then end every worker."""
         try:
             deadline = time.monotonic() + GRACE_S
-            running = {worker.line for worker, one in self._assignments.items() if one.number is not None}
+            running = {worker.line for worker, given in self._assignments.items() if given.number is not None}
             while running and (left_s := deadline - time.monotonic()) > 0:
                 running.difference_update(wait(running, left_s))
         finally:
@@ -365,25 +365,25 @@ class Team:
         self._assignments[worker] = _Assignment(number, deadline)
         worker.give(tasks[number])
 
-    def _ready(self) -> list[Worker]:
-        """Wait, and return the workers that have answered, died, or taken too long."""
-        first = min(one.deadline for one in self._assignments.values())
+    def _wait_for_workers(self) -> list[Worker]:
+        """Wait for workers, and return those that have answered, crashed, or exceeded the time limit."""
+        first = min(given.deadline for given in self._assignments.values())
         timeout_s = None if first == _FOREVER else max(0.0, first - time.monotonic())
         lines = set(wait([worker.line for worker in self._assignments], timeout_s))
         now = time.monotonic()
-        return [worker for worker, one in self._assignments.items() if worker.line in lines or now >= one.deadline]
+        return [worker for worker, given in self._assignments.items() if worker.line in lines or now >= given.deadline]
 
 
 def _reason_of_death(code: int, late_s: float | None) -> str:
-    """Return why a worker did not answer, by its exit code, or the time limit of its task."""
+    """Return the reason why a worker did not answer, from its exit code or the time limit of its task."""
     if late_s is not None:
         return f"it took more than the {late_s:g} s of --set timeout"
     cause = f"by signal {-code}" if code < 0 else f"with exit code {code}"
-    return f"its worker ended {cause}, {ATTEMPTS} times, most likely for lack of memory; thin it, or use fewer --jobs"
+    return f"its worker ended {cause}, {ATTEMPTS} times, probably for lack of memory; decimate it, or use fewer --jobs"
 
 
 def _serve(line: Connection, work: Work[Any, Any]) -> None:
-    """Do the tasks that arrive on `line` until it ends; runs in the worker process."""
+    """Do the tasks that arrive on `line` until it closes; this runs in the worker process."""
     from threadpoolctl import threadpool_limits
 
     threadpool_limits(1)

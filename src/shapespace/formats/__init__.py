@@ -1,1 +1,1 @@
-"""Shape models in the formats of other tools: one module for each, and all of them in `registry`."""
+"""Shape models in the formats of other tools: one module per format, and `registry` with all formats."""

@@ -29,7 +29,7 @@ Item = TypeVar("Item")
 
 
 def is_eos(path: Path, head: bytes) -> bool:
-    """Whether it begins with a version of eos and a mean of one column."""
+    """Return whether a file begins with a version of eos and a mean of one column."""
     if path.suffix.lower() != ".bin" or len(head) < 12:
         return False
     version, rows, columns = struct.unpack_from("<Iii", head)
@@ -44,16 +44,16 @@ def read_eos(path: Path) -> LinearModel:
     data = read_bytes(path)
     if _are_blendshapes(data[:16]):
         raise ModelFileError(
-            f"{path} holds the blendshapes of an eos model, without the model; give that, and this with --expressions."
+            f"{path} contains only the blendshapes of an eos model; give the model, and this file with --expressions."
         )
     try:
         return _model(_Archive(data))
-    except (_DamagedError, ValueError, OverflowError) as error:
-        raise ModelFileError(f"{path} is damaged, or no model of eos: {error}; {_AGAIN}.") from error
+    except (_DamagedArchiveError, ValueError, OverflowError) as error:
+        raise ModelFileError(f"{path} is damaged, or not a model of eos: {error}; {_AGAIN}.") from error
 
 
 def write_eos(model: LinearModel, path: Path) -> Sequence[str]:
-    """As `ModelFormat.write`; single precision, version 4."""
+    """Write version 4 in single precision, see `ModelFormat.write`."""
     out = bytearray(struct.pack("<I", _NEWEST))
     out += _pca_bytes(model.mean.ravel(), model.shape.moved, model)
     out += _pca_bytes(_NOTHING, _NOTHING, None)
@@ -73,12 +73,12 @@ def write_eos(model: LinearModel, path: Path) -> Sequence[str]:
     write_bytes(path, bytes(out))
     notes = ["Numbers are in single precision.", *_moved_landmarks(model)]
     if model.provenance or model.licence:
-        notes.append("Provenance and licence are left out: eos has no place for them.")
+        notes.append("Provenance and licence are omitted, since eos has no field for them.")
     return notes
 
 
 def _moved_landmarks(model: LinearModel) -> list[str]:
-    """Return a sentence on the distances by which landmarks move to vertices; none if all are at vertices."""
+    """Return a sentence on the distances by which landmarks move to vertices; an empty list if all are at vertices."""
     vertices = model.mean[list(model.landmarks.values())]
     moved_mm = np.linalg.norm(model.landmarks.interpolate(model.mean) - vertices, axis=1) * (model.mm or 1.0)
     if not moved_mm.any():
@@ -94,7 +94,7 @@ def read_blendshapes(path: Path) -> Modes:
 
     Raises:
         FileError: it cannot be read.
-        ModelFileError: it is damaged, or another thing.
+        ModelFileError: it is damaged, or not such a file.
     """
     check_file(path, _LARGEST_BYTES, _BLENDSHAPES_AGAIN)
     archive = _Archive(read_bytes(path))
@@ -102,22 +102,22 @@ def read_blendshapes(path: Path) -> Modes:
         with np.errstate(invalid="ignore"):
             names, displacements = archive.blendshapes()
         if not archive.at_end:
-            raise _DamagedError("there is more in it than blendshapes")
+            raise _DamagedArchiveError("it contains other data than blendshapes")
         if len(set(map(len, displacements))) != 1 or len(displacements[0]) % 3:
-            raise _DamagedError("they have different numbers of vertices")
-    except (_DamagedError, ValueError, OverflowError) as error:
-        raise ModelFileError(f"{path} holds no blendshapes of eos: {error}; {_BLENDSHAPES_AGAIN}.") from error
+            raise _DamagedArchiveError("they have different numbers of vertices")
+    except (_DamagedArchiveError, ValueError, OverflowError) as error:
+        raise ModelFileError(f"{path} contains no blendshapes of eos: {error}; {_BLENDSHAPES_AGAIN}.") from error
     return Modes(np.stack(displacements, axis=1), names)
 
 
 def _are_blendshapes(head: bytes) -> bool:
-    """Whether a file begins with a number of blendshapes and the length of the first one's name."""
+    """Return whether a file begins with a number of blendshapes and the length of the first name."""
     count, length = struct.unpack_from("<QQ", head) if len(head) >= 16 else (0, 0)
     return bool(0 < count < 2**16 and 0 < length < _MOST_NAME_BYTES)
 
 
-class _DamagedError(ValueError):
-    """The bytes are not an eos archive."""
+class _DamagedArchiveError(ValueError):
+    """The bytes are not an eos archive; the message gives the reason, as a clause."""
 
 
 class _Archive:
@@ -131,7 +131,7 @@ class _Archive:
     def fields(self, layout: str) -> tuple[Any, ...]:
         return struct.unpack(f"<{layout}", self._take(struct.calcsize(f"<{layout}")))
 
-    def one(self, layout: str) -> int:
+    def number(self, layout: str) -> int:
         return int(self.fields(layout)[0])
 
     def array(self, kind: str, count: int, *row: int) -> npt.NDArray[Any]:
@@ -142,58 +142,58 @@ class _Archive:
     def matrix(self) -> FloatArray:
         rows, columns = self.fields("ii")
         if rows < 0 or columns < 0:
-            raise _DamagedError("a matrix has a negative size")
+            raise _DamagedArchiveError("a matrix has a negative size")
         return self.array("<f4", rows * columns).reshape(columns, rows).T.astype(np.float64)
 
     def vector(self, kind: str, *row: int) -> npt.NDArray[Any]:
-        return self.array(kind, self.one("Q"), *row)
+        return self.array(kind, self.number("Q"), *row)
 
     def text(self) -> str:
-        size = self.one("Q")
+        size = self.number("Q")
         if size > _MOST_NAME_BYTES:
-            raise _DamagedError("a name is too long")
+            raise _DamagedArchiveError("a name is too long")
         return self._take(size).decode(errors="replace")
 
     def many(self, read_item: Callable[[], Item], least_bytes: int) -> list[Item]:
-        count = self.one("Q")
+        count = self.number("Q")
         if count * least_bytes > len(self._data) - self._at:
-            raise _DamagedError("it is cut short")
+            raise _DamagedArchiveError("it is cut short")
         return [read_item() for _ in range(count)]
 
     def blendshapes(self) -> tuple[tuple[str, ...], list[FloatArray]]:
-        """Return their names and displacements (D,)."""
+        """Return the names and displacements (D,) of the blendshapes."""
         pairs = self.many(lambda: (self.text(), self.matrix().ravel()), 16)
         return tuple(name for name, _ in pairs), [displacements for _, displacements in pairs]
 
     def _take(self, size: int) -> bytes:
         if size > len(self._data) - self._at:
-            raise _DamagedError("it is cut short")
+            raise _DamagedArchiveError("it is cut short")
         self._at += size
         return self._data[self._at - size : self._at]
 
 
 def _model(archive: _Archive) -> LinearModel:
-    version = archive.one("I")
+    version = archive.number("I")
     if not 1 <= version <= _NEWEST:
-        raise _DamagedError(f"it is of version {version}, and versions 1 to {_NEWEST} are known")
+        raise _DamagedArchiveError(f"it is of version {version}, and versions 1 to {_NEWEST} are supported")
     mean, displacements, faces = _pca(archive)
     colour = _pca(archive)[0]
     expression, notes = None, list[str]()
-    if version >= 2 and not archive.one("B"):
+    if version >= 2 and not archive.number("B"):
         expression, displaced = _expression(archive, len(mean))
         mean = mean + displaced
     landmarks: dict[str, int] = {}
-    if version >= 3 and not archive.one("B"):
-        landmarks = dict(archive.many(lambda: (archive.text(), archive.one("i")), 12))
+    if version >= 3 and not archive.number("B"):
+        landmarks = dict(archive.many(lambda: (archive.text(), archive.number("i")), 12))
     textured = len(archive.vector("<f8", 2))
     if version >= 4:
         archive.vector("<i4", 3)
     if not archive.at_end:
-        raise _DamagedError("there is more in it than a model")
+        raise _DamagedArchiveError("it contains other data than a model")
     if len(colour):
-        notes.append("Its model of colour is left out.")
+        notes.append("Its colour model is omitted.")
     if textured:
-        notes.append("Its texture coordinates are left out.")
+        notes.append("Its texture coordinates are omitted.")
     is_sfm = (len(mean) // 3, displacements.shape[1], len(faces)) == _SFM
     return LinearModel(
         mean=mean.reshape(-1, 3),
@@ -208,27 +208,27 @@ def _model(archive: _Archive) -> LinearModel:
 
 
 def _pca(archive: _Archive) -> tuple[FloatArray, FloatArray, npt.NDArray[Any]]:
-    """Return mean (D,), what one standard deviation of each mode does (D, K), and triangles."""
+    """Return mean (D,), displacements (D, K) of one standard deviation of each mode, and triangles."""
     mean, basis, variance = archive.matrix(), archive.matrix(), archive.matrix()
     faces = archive.vector("<i4", 3)
     if mean.shape[1] > 1 or basis.shape != (mean.size, variance.size) or (variance < 0).any() or mean.size % 3:
-        raise _DamagedError(f"its parts have the shapes {mean.shape}, {basis.shape} and {variance.shape}")
+        raise _DamagedArchiveError(f"its parts have the shapes {mean.shape}, {basis.shape} and {variance.shape}")
     return mean.ravel(), scale_columns(basis, np.sqrt(variance.ravel())), faces
 
 
 def _expression(archive: _Archive, size: int) -> tuple[Modes, FloatArray]:
     """Return the modes of expressions, and their mean displacement (D,)."""
-    kind = archive.one("i")
+    kind = archive.number("i")
     if kind == _PCA:
         mean_displacement, displacements, _ = _pca(archive)
         if len(mean_displacement) != size:
-            raise _DamagedError("expressions have another number of vertices")
+            raise _DamagedArchiveError("expressions have another number of vertices")
         return Modes(displacements), mean_displacement
     if kind != _BLENDSHAPES:
-        raise _DamagedError(f"there is no kind {kind} of expressions")
+        raise _DamagedArchiveError(f"its type of expressions, {kind}, is unknown")
     names, blendshapes = archive.blendshapes()
     if not blendshapes or any(len(displacements) != size for displacements in blendshapes):
-        raise _DamagedError("blendshapes have another number of vertices")
+        raise _DamagedArchiveError("blendshapes have another number of vertices")
     return Modes(np.stack(blendshapes, axis=1), names), np.zeros(size)
 
 

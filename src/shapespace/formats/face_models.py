@@ -1,4 +1,4 @@
-"""Models of faces and bodies as they are downloaded: FLAME and the SMPL family, and those in files of MATLAB.
+"""Published models of faces and bodies: FLAME and the SMPL family, and models in MATLAB files.
 
 FLAME and SMPL have a template and blend shapes in metres, as `.npz` or as a pickle. The Basel Face Model of 2009, LSFM
 and LYHM are in `.mat` files, also of version 7.3 (HDF5).
@@ -29,17 +29,18 @@ from shapespace.io.sandbox import (
     read_pickle_sandboxed,
 )
 
-_AGAIN = "give the file as it was downloaded"
+_AGAIN = "give the original downloaded file"
 _LARGEST_BYTES = 2**30  # 1 GiB
 _MM = 1000.0  # FLAME is in metres
 _KEYS: Final = {"template": ("v_template", "default_v"), "modes": ("shapedirs",), "faces": ("f", "faces")}
 _JOINTS = ("weights", "J", "joints")
 _FAMILY: Final = {5: "FLAME", 16: "MANO", 24: "SMPL", 52: "SMPL+H", 55: "SMPL-X"}
-"""By their number of joints."""
+"""Number of joints -> name of the model."""
 _BY_VERTICES: Final = {5023: "FLAME", 778: "MANO", 6890: "SMPL", 10475: "SMPL-X"}
 _WITH_EXPRESSION = ("FLAME", "SMPL-X")
 _IDENTITY: Final = {150: 100, 20: 10}
-"""Modes of identity among so many, the others being of expression; of more than `_MOST_IDENTITY` the first."""
+"""Number of modes -> number of identity modes among them; the others are expression modes. A model with more than
+`_MOST_IDENTITY` modes begins with that many identity modes."""
 _MOST_IDENTITY = 300  # FLAME: shapedirs has 300 identity modes before the expression modes
 _LARGEST_MAT_BYTES = 2**31  # 2 GiB
 _HDF5_AT = 512  # MAT-file 7.3: HDF5 begins after a user block of 512 bytes
@@ -47,18 +48,18 @@ _HDF5_AT = 512  # MAT-file 7.3: HDF5 begins after a user block of 512 bytes
 
 @dataclass(frozen=True)
 class _Layout:
-    """Variable names of one kind of file, and their meaning.
+    """Variable names of a file format, and their meaning.
 
     Args:
-        title: of the model, for provenance.
-        licence: of it.
-        mean, basis, spread, faces: paths.
-        is_stddev: whether `spread` is standard deviations and not variances.
-        is_clockwise: whether triangles are seen from inside.
-        first_vertex: the number of the first vertex.
-        mm: how many mm one unit is, or None.
-        n_training: how many shapes it was made of, or None; a path in the file, or a number.
-        textured: where its colour is.
+        title: name of the model, for provenance.
+        licence: licence of the model.
+        mean, basis, spread, faces: paths of the variables in the file.
+        is_stddev: whether `spread` contains standard deviations; False for variances.
+        is_clockwise: whether triangles are clockwise seen from outside.
+        first_vertex: number of the first vertex in `faces`.
+        mm: length of the unit of the file, mm, or None if unknown.
+        n_training: number of training shapes, or its path in the file; None if unknown.
+        textured: path of the colour model in the file.
     """
 
     title: str
@@ -95,7 +96,7 @@ _WANTED = ("shapeMU", "shapePC", "shapeEV", "tl", "shp", "tri", "mean", "compone
 
 
 def is_flame(path: Path, head: bytes) -> bool:
-    """Whether it is named as a pickle, or an .npz with a template and its modes in it."""
+    """Return whether a file has the name of a pickle, or is an .npz with a template and its modes."""
     if path.suffix.lower() == ".pkl":
         return True
     return path.suffix.lower() == ".npz" and head.startswith(b"PK") and _has_template(path)
@@ -108,18 +109,20 @@ def read_flame(path: Path) -> LinearModel:
     if path.suffix.lower() == ".npz":
         arrays: Mapping[str, npt.NDArray[Any]] = read_arrays(path, _AGAIN, array_names)
     else:
-        arrays = _unpickled(path, array_names)
+        arrays = _read_pickle(path, array_names)
     members = {role: next((arrays[name] for name in names if name in arrays), None) for role, names in _KEYS.items()}
     template, modes, faces = (members[role] for role in _KEYS)
     if template is None or modes is None:
-        raise ModelFileError(f"{path} holds no v_template and shapedirs, as models of the SMPL family do; {_AGAIN}.")
+        raise ModelFileError(
+            f"{path} contains no v_template and shapedirs, unlike models of the SMPL family; {_AGAIN}."
+        )
     n = len(template) if template.ndim == 2 else 0
     if not n or template.shape[1] != 3 or modes.shape[:2] != template.shape or modes.ndim != 3:
         raise ModelFileError(
             f"{path} is damaged: its template and modes have the shapes {template.shape} and {modes.shape}; {_AGAIN}."
         )
     if any(array.dtype.kind not in "iuf" for array in (template, modes, *([] if faces is None else [faces]))):
-        raise ModelFileError(f"{path} is damaged: its arrays are not of numbers; {_AGAIN}.")
+        raise ModelFileError(f"{path} is damaged: its arrays do not contain numbers; {_AGAIN}.")
     family = _family(arrays, n)
     displacements = np.asarray(modes, dtype=np.float64).reshape(3 * n, -1)
     n_identity = None
@@ -135,7 +138,7 @@ def read_flame(path: Path) -> LinearModel:
         provenance=f"{family or 'SMPL family'} model {path.name}",
         licence=f"{family or 'SMPL family'}: non-commercial research only, unless its own licence allows more",
         notes=(
-            "Its pose rig (joints, skinning weights, corrections by pose) is left out; the pose is the template's.",
+            "Its pose rig (joints, skinning weights, pose corrections) is omitted; the pose is that of the template.",
         ),
     )
 
@@ -153,20 +156,20 @@ def _has_template(path: Path) -> bool:
     try:
         with zipfile.ZipFile(path) as archive:
             return {"v_template.npy", "shapedirs.npy"} <= set(archive.namelist())
-    except Exception:  # a damaged archive may raise anything at all
+    except Exception:  # a damaged archive may raise any exception
         return False
 
 
-def _unpickled(path: Path, array_names: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
+def _read_pickle(path: Path, array_names: Sequence[str]) -> dict[str, npt.NDArray[Any]]:
     try:
         arrays = read_pickle_sandboxed(path, array_names).arrays
     except SandboxError as error:
-        raise ModelFileError(f"{path} is not read: {error}; {_AGAIN}.") from error
+        raise ModelFileError(f"{path} cannot be read: {error}; {_AGAIN}.") from error
     return {name.removeprefix("/"): array for name, array in arrays.items()}
 
 
 def is_matlab(path: Path, head: bytes) -> bool:
-    """Whether it is named as a file of MATLAB."""
+    """Return whether a file has the ending of a MATLAB file."""
     return path.suffix.lower() == ".mat" and bool(head)
 
 
@@ -185,7 +188,7 @@ def read_matlab(path: Path) -> LinearModel:
         )
         if layout is None:
             known = ", ".join(candidate.title for candidate in _LAYOUTS)
-            raise ModelFileError(f"{path} holds no shape model of a kind that is known ({known}).")
+            raise ModelFileError(f"{path} contains no supported shape model ({known}).")
         return _matlab_model(tree, layout)
     except SandboxError as error:
         raise ModelFileError(f"{path} is damaged or cut short: {error}; {_AGAIN}.") from error
@@ -199,7 +202,7 @@ def _matlab_tree(path: Path) -> Tree:
     tree = read_hdf5_sandboxed(
         path, leave=("/texMU", "/texPC", "/tex", "/segbin", "/segbb", "/segMM", "/segMB", "/#refs#")
     )
-    # MATLAB has the last axis first.
+    # MATLAB stores arrays with the last axis first.
     return Tree({name: array.T for name, array in tree.arrays.items()}, groups=tree.groups)
 
 
@@ -211,7 +214,7 @@ def _matlab_model(tree: Tree, layout: _Layout) -> LinearModel:
     if basis.shape == (len(spread), len(mean)) != (len(mean), len(spread)):
         basis = basis.T
     if not all(map(are_measurable, (mean, basis, spread))) or not (spread >= 0).all():
-        raise SandboxError("its numbers are not finite, too large, or spread below 0")
+        raise SandboxError("its numbers are not finite, too large, or its spread is negative")
     if len(mean) % 3 or basis.shape != (len(mean), len(spread)):
         raise SandboxError(f"its mean, basis and spread have the shapes {mean.shape}, {basis.shape} and {spread.shape}")
     n_training = layout.n_training
@@ -230,7 +233,7 @@ def _matlab_model(tree: Tree, layout: _Layout) -> LinearModel:
         n_training=n_training,
         provenance=layout.title,
         licence=layout.licence,
-        notes=("Its model of colour is left out.",) if layout.textured in tree.groups else (),
+        notes=("Its colour model is omitted.",) if layout.textured in tree.groups else (),
     )
 
 
@@ -239,7 +242,7 @@ def _matlab_faces(triangles: npt.NDArray[Any] | None, layout: _Layout, n: int) -
         return None
     faces = triangles.T if triangles.ndim == 2 and triangles.shape[0] == 3 != triangles.shape[1] else triangles
     if faces.ndim != 2 or faces.shape[1] != 3 or not np.isfinite(faces).all() or np.abs(faces).max() > n:
-        raise SandboxError(f"its triangles have the shape {triangles.shape}, or name vertices that it does not have")
-    # Those of menpo count from 0, those of MATLAB's own from 1.
+        raise SandboxError(f"its triangles have the shape {triangles.shape}, or refer to vertices that do not exist")
+    # Files of menpo count from 0, other MATLAB files from 1.
     faces = faces.astype(np.int32) - (layout.first_vertex or int(faces.min() > 0 and faces.max() == n))
     return faces[:, [0, 2, 1]] if layout.is_clockwise else faces

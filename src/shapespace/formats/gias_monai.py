@@ -1,4 +1,4 @@
-"""Principal components with the mean surface beside them: GIAS2 and MONAI-Physio.
+"""Principal components with the mean surface in a separate file: GIAS2 and MONAI-Physio.
 
 GIAS2 has `NAME.pc.npz` and `NAME_mean.*`, MONAI-Physio (PhysioTwin4D) `pca_model.json` and `pca_mean_surface.vtp`.
 """
@@ -31,7 +31,7 @@ _MONAI_KEYS = (b'"eigenvalues"', b'"explained_variance_ratio"')
 
 
 def is_gias(path: Path, head: bytes) -> bool:
-    """Whether it is an `.npz` that is called so, or begins with the mean as GIAS2 saves it."""
+    """Return whether a file has the ending of GIAS2, or is an `.npz` that begins with the mean as in GIAS2."""
     if not path.name.lower().endswith(".npz") or head[:2] != b"PK":
         return False
     member_name = head[30 : 30 + int.from_bytes(head[26:28], "little")]
@@ -39,7 +39,7 @@ def is_gias(path: Path, head: bytes) -> bool:
 
 
 def read_gias(path: Path) -> LinearModel:
-    """Read `PrincipalComponents` of GIAS2, interleaved as `gias-trainpcashapemodel` has them, or all x first."""
+    """Read `PrincipalComponents` of GIAS2 with interleaved coordinates (`gias-trainpcashapemodel`), or all x first."""
     check_file(path, LARGEST_BYTES, _AGAIN)
     try:
         with open_file(path) as stream:
@@ -49,33 +49,33 @@ def read_gias(path: Path) -> LinearModel:
         raise
     except (KeyError, ValueError, OSError) as error:
         problem = f"it has no {error}" if isinstance(error, KeyError) else str(error)
-        raise ModelFileError(f"{path} holds no principal components of GIAS2 ({problem}); {_AGAIN}.") from error
+        raise ModelFileError(f"{path} contains no principal components of GIAS2 ({problem}); {_AGAIN}.") from error
     mean, variance = mean.ravel(), variance.ravel()
     if modes.ndim != 2 or mean.size % 3 or len(modes) != mean.size or modes.shape[1] > variance.size:
         raise ModelFileError(
-            f"{path} has parts that do not belong together: mean {mean.shape}, modes {modes.shape}, weights "
+            f"{path} has inconsistent parts: mean {mean.shape}, modes {modes.shape}, weights "
             f"{variance.shape}; {_AGAIN}."
         )
     variance = variance[: modes.shape[1]]
     displacements = scale_columns(modes, np.sqrt(np.maximum(variance, 0.0)))
     notes: list[str] = []
-    spread = _optional(members, "SD")
+    spread = _read_optional(members, "SD")
     if spread is not None and spread.size == mean.size:
         displacements = displacements * spread.reshape(-1, 1)
-        notes.append("Each coordinate was divided by its standard deviation, which is undone.")
-    scores = _optional(members, "projectedWeights")
+        notes.append("Each coordinate was divided by its standard deviation; this is reverted.")
+    scores = _read_optional(members, "projectedWeights")
     stem = path.name[: -len(".pc.npz")] if path.name.lower().endswith(".pc.npz") else path.stem
     candidates = (path.with_name(f"{stem}_mean{ending}") for ending in MESH_ENDINGS)
     surface = next((candidate for candidate in candidates if candidate.is_file()), None)
     faces: IntArray | None = None
     if surface is None:
-        notes.append("There is no surface of its mean beside it (NAME_mean.ply), so it is a point model.")
+        notes.append("Its folder contains no surface of its mean (NAME_mean.ply), so it is a point model.")
     else:
-        points, faces, blocked = _fitting(surface, mean, path)
+        points, faces, blocked = _match_surface(surface, mean, path)
         if blocked:
             mean = points.ravel()
             displacements = displacements.reshape(3, len(points), -1).transpose(1, 0, 2).reshape(mean.size, -1)
-            notes.append("Its coordinates stood one after another, all x first.")
+            notes.append("Its coordinates were stored one after another, all x first.")
     return LinearModel(
         mean=mean.reshape(-1, 3),
         shape=Modes(displacements),
@@ -89,19 +89,19 @@ def read_gias(path: Path) -> LinearModel:
 def _numbers(data: bytes) -> FloatArray:
     array = npy_array(data)
     if array.dtype.kind not in "fiu":
-        raise ValueError("it holds other things than numbers")
+        raise ValueError("it contains other data than numbers")
     return array.astype(np.float64)
 
 
-def _optional(members: dict[str, bytes], name: str) -> FloatArray | None:
-    """Return an array that GIAS2 saves as a pickled None where it has none."""
+def _read_optional(members: dict[str, bytes], name: str) -> FloatArray | None:
+    """Return an optional array, which GIAS2 saves as a pickled None if it is missing."""
     try:
         return _numbers(members[f"{name}.npy"])
     except (KeyError, ValueError):
         return None
 
 
-def _fitting(surface: Path, mean: FloatArray, path: Path) -> tuple[FloatArray, IntArray | None, bool]:
+def _match_surface(surface: Path, mean: FloatArray, path: Path) -> tuple[FloatArray, IntArray | None, bool]:
     """Return vertices and triangles, and whether `mean` has all x before all y."""
     mesh = read_mesh(surface)
     if not np.isfinite(mean).all() or not np.isfinite(mesh.vertices).all():
@@ -112,15 +112,15 @@ def _fitting(surface: Path, mean: FloatArray, path: Path) -> tuple[FloatArray, I
         if points.shape == mesh.vertices.shape and np.abs(points - mesh.vertices).max() <= _SAME * size:
             return points, mesh.faces, blocked
     for points, blocked in layouts:
-        # STL has no order of vertices, only their places.
+        # STL does not preserve the order of vertices, only their positions.
         nearest = np.asarray(cKDTree(points).query(mesh.vertices)[1], dtype=np.int32)
         if mesh.faces is not None and np.abs(points[nearest] - mesh.vertices).max() <= _SAME * size:
             return points, nearest[mesh.faces], blocked
-    raise ModelFileError(f"{path} has another mean than {surface.name} beside it; remove or rename that surface.")
+    raise ModelFileError(f"{path} has another mean than {surface.name} in its folder; remove or rename that surface.")
 
 
 def is_monai(path: Path, head: bytes) -> bool:
-    """Whether it is, or holds, a `pca_model.json`, or JSON that begins with what such a file does."""
+    """Return whether a path is a `pca_model.json` or JSON with the same beginning, or a folder with such a file."""
     if path.is_dir():
         return (path / _MONAI_MODEL).is_file() and (path / _MONAI_SURFACE).is_file()
     if path.suffix.lower() != ".json":
@@ -129,12 +129,12 @@ def is_monai(path: Path, head: bytes) -> bool:
 
 
 def read_monai(path: Path) -> LinearModel:
-    """Read mean surface and principal components, as a folder, or as the JSON in it."""
+    """Read mean surface and principal components from a folder, or from the JSON file in it."""
     file = path / _MONAI_MODEL if path.is_dir() else path
     check_file(file, _LARGEST_JSON_BYTES, _EXPORT_AGAIN)
     surface = file.with_name(_MONAI_SURFACE)
     if not surface.is_file():
-        raise ModelFileError(f"{file} needs the surface {_MONAI_SURFACE} beside it; copy it there.")
+        raise ModelFileError(f"{file} needs the surface {_MONAI_SURFACE} in its folder; copy it there.")
     mean = read_mesh(surface)
     tree = json_object(json_value(read_bytes(file), file))
     try:
@@ -146,18 +146,18 @@ def read_monai(path: Path) -> LinearModel:
     if components.ndim != 2 or components.shape != (variance.size, mean.vertices.size) or (variance < 0).any():
         raise ModelFileError(
             f"{file} has components of the shape {components.shape} and {variance.size} eigenvalues, which do not "
-            f"belong to the {len(mean.vertices)} points of {_MONAI_SURFACE}; {_EXPORT_AGAIN}."
+            f"match the {len(mean.vertices)} points of {_MONAI_SURFACE}; {_EXPORT_AGAIN}."
         )
     return LinearModel(
         mean=mean.vertices,
-        shape=Modes(scale_columns(components.T, np.sqrt(variance)), total_variance=_total(variance, ratio)),
+        shape=Modes(scale_columns(components.T, np.sqrt(variance)), total_variance=_total_variance(variance, ratio)),
         faces=mean.faces,
         provenance=f"MONAI-Physio model in {file.parent.name}",
     )
 
 
-def _total(variance: FloatArray, ratio: npt.NDArray[np.float64]) -> float | None:
-    """Return the variance of all modes, those that were cut off too, by the share that the first has."""
+def _total_variance(variance: FloatArray, ratio: npt.NDArray[np.float64]) -> float | None:
+    """Return the total variance, including omitted modes, from the explained variance ratio of the first mode."""
     if ratio.shape != variance.shape or not variance.size or not 0 < ratio[0] <= 1:
         return None
     return float(variance[0] / ratio[0])

@@ -19,7 +19,7 @@ from shapespace.io.read_limits import LARGEST_MESH_FILE_BYTES
 from shapespace.types import FloatArray, IntArray, Mesh
 
 _MM: Final = 1000.0
-"""In one unit of glTF, which is a metre."""
+"""Length of the unit of glTF, a metre, in mm."""
 _SUFFIXES = (".glb", ".gltf")
 _AGAIN = "export it again"
 _TARGETS = b'"targets"'
@@ -27,7 +27,7 @@ _POINT_CLOUD, _SURFACE = 0, 4  # glTF 2.0 primitive.mode: POINTS, TRIANGLES
 
 
 def is_gltf_model(path: Path, head: bytes) -> bool:
-    """Whether it is glTF and speaks of morph targets."""
+    """Return whether a file is glTF and mentions morph targets."""
     if path.suffix.lower() not in _SUFFIXES or not path.is_file():
         return False
     try:
@@ -50,13 +50,15 @@ def read_gltf_model(path: Path) -> LinearModel:
     if facts.get("vertices") != len(mean):
         mean, displacements, faces, merged = _without_seams(mean, displacements, faces)
         if merged:
-            notes.append(f"{merged} vertices that lie and move with another, as seams have them, are joined to it.")
+            notes.append(
+                f"{merged} vertices that are equal to another in position and displacements, as at seams, are merged."
+            )
     if morphs.n_others:
-        notes.append(f"{morphs.n_others} more meshes of the scene are left out.")
+        notes.append(f"{morphs.n_others} more meshes of the scene are omitted.")
     if any(morphs.weights):
         notes.append("Its weights are not zero; the mean is the shape without them.")
     if not facts:
-        notes.append("A weight of one is taken as one standard deviation.")
+        notes.append("A weight of 1 is interpreted as one standard deviation.")
     n_identity = facts.get("n_identity")
     is_identity = [bool(IDENTITY.fullmatch(name)) for name in morphs.names]
     if not morphs.names and isinstance(n_identity, int):
@@ -77,12 +79,12 @@ def read_gltf_model(path: Path) -> LinearModel:
 
 
 def write_gltf_model(model: LinearModel, path: Path) -> Sequence[str]:
-    """As `ModelFormat.write`; single precision, metres, normals of mean and targets."""
+    """Write single precision, metres, and normals of mean and targets, see `ModelFormat.write`."""
     tree, binary = _content(model, path)
     write_bytes(path, (gltf_bytes if path.suffix.lower() == ".gltf" else glb_bytes)(tree, binary))
     notes = [
-        "Lengths are in metres, as glTF demands, and numbers in single precision.",
-        "A weight of one is one standard deviation; weights run both ways, so widen the sliders to -3 to 3.",
+        "Lengths are in metres, as glTF requires, and numbers in single precision.",
+        "A weight of 1 is one standard deviation; weights may be negative, so set the range of the sliders to -3 to 3.",
     ]
     if model.faces is None:
         notes.append("It is a point model, so there are no normals.")
@@ -92,7 +94,7 @@ def write_gltf_model(model: LinearModel, path: Path) -> Sequence[str]:
 def _without_seams(
     mean: FloatArray, displacements: FloatArray, faces: IntArray | None
 ) -> tuple[FloatArray, FloatArray, IntArray | None, int]:
-    """Return them with vertices joined that are equal in all, and how many that were; in order of first appearance."""
+    """Return the arrays with equal vertices merged, in order of first appearance, and the number of removed ones."""
     if faces is None:
         return mean, displacements, faces, 0
     n = len(mean)
@@ -135,12 +137,12 @@ def _content(model: LinearModel, path: Path) -> tuple[dict[str, Any], bytes]:
     if model.faces is not None:
         attributes["NORMAL"] = buffer.vectors(_normals(mean, model.faces, upright=True), bounds=False)
         for target, step in zip(targets, steps, strict=True):
-            # As much to either side, since weights run both ways.
+            # Bounds for both signs, since weights may be negative.
             normal_changes = (_normals(mean + step, model.faces) - _normals(mean - step, model.faces)) / 2
             target["NORMAL"] = buffer.vectors(normal_changes, bounds=False)
         primitive |= {"mode": _SURFACE, "indices": buffer.indices(model.faces)}
     if not buffer.is_finite:
-        raise InputError(f"{path} cannot be written: glTF is of single precision, and the model is too large for it.")
+        raise InputError(f"{path} cannot be written: the model is too large for the single precision of glTF.")
     extras = {"targetNames": target_names(model), KEY: facts_of(model)}
     mesh = {"name": path.stem, "primitives": [primitive], "weights": [0.0] * len(targets), "extras": extras}
     licence = {"copyright": model.licence} if model.licence else {}
@@ -150,6 +152,6 @@ def _content(model: LinearModel, path: Path) -> tuple[dict[str, Any], bytes]:
 def _normals(vertices: FloatArray, faces: IntArray, *, upright: bool = False) -> FloatArray:
     normals = vertex_normals(Mesh(vertices, faces))
     if upright:
-        # glTF asks for unit vectors, also where no triangle gives one.
+        # glTF requires unit vectors, also at vertices without a triangle.
         normals[~normals.any(axis=1)] = (0.0, 0.0, 1.0)
     return normals

@@ -1,8 +1,8 @@
-"""Linear models as files of other tools store them, their metadata as JSON, and what readers and writers are.
+"""Linear models as stored in files of other tools, their metadata as JSON, and the interface of readers and writers.
 
-Modes are held as what one standard deviation of each does, U sqrt(lambda), in the unit of the file: every convention of
-basis and spread is that product, and a basis that is not orthonormal loses nothing by it. Formats with a free text
-field keep landmarks, provenance and licence there, as `facts_of` has them.
+A mode is stored as the displacement of one standard deviation, a column of U sqrt(lambda), in the unit of the file: all
+conventions of basis and spread have this product, which is also exact for a basis that is not orthonormal. Formats with
+a free text field store landmarks, provenance and licence there, in the form of `facts_of`.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from shapespace.types import FloatArray, IntArray, SurfaceLandmarks, read_only
 ORTHOGONAL: Final = 1e-3  # largest |U^T U - I|; single precision stays below
 _LARGEST = 1e30  # coordinates whose squares stay finite in float64
 _NO_STDDEV = 1e-6
-"""Of the largest one; what single precision makes of a mode that is not there."""
+"""Share of the largest standard deviation below which a mode is only rounding of single precision."""
 IDENTITY: Final = re.compile(r"identity[ _.-]?\d+", re.IGNORECASE)
-"""Names of modes of identity."""
+"""Pattern of the names of identity modes."""
 KEY: Final = "shapespace"
-"""Under which the facts stand."""
+"""Key of the metadata in a file."""
 _PLACES: Final = "landmark_triangles"
 """Landmarks between vertices: name -> vertices, barycentric coordinates, and distance of the given point in mm."""
 _LONGEST_WORDS = 20_000  # characters; longer than any licence text
@@ -41,13 +41,14 @@ _MOST_LANDMARKS = 10_000  # limit on damaged files, far above published markups
 
 @dataclass(frozen=True, eq=False)
 class Modes:
-    """Modes of one kind: x = mean + moved @ z, with z independent and of variance 1.
+    """Modes of identity or of expression: x = mean + moved @ z, with z independent and of variance 1.
 
     Args:
-        moved: (3V, K) what one standard deviation of each does to x, y, z of vertex 0, then of vertex 1, and so on.
-        names: (K,) or none.
-        total_variance: of all modes, those that the file does not hold too, in the file's unit squared; None where it
-            does not say.
+        moved: (3V, K) displacements of one standard deviation of each mode: x, y, z of vertex 0, then of vertex 1, and
+            so on, in the unit of the file.
+        names: (K,) names of the modes, or empty.
+        total_variance: variance of all modes, including those that the file omits, in the unit of the file squared;
+            None if the file does not state it.
     """
 
     moved: FloatArray
@@ -63,18 +64,18 @@ class LinearModel:
     """One linear shape model as stored in a file.
 
     Args:
-        mean: (V, 3) vertices where all coefficients are zero, with the mean of the expressions.
-        shape: its modes; of identity alone where `expression` is there.
-        expression: modes that come on top of those of identity, or None.
-        faces: (M, 3) counter-clockwise from outside, or None for a point model.
-        mm: how many mm one unit of the file is; None where the format does not say, which is then taken as mm.
-        landmarks: named points on the surface; a mapping of name to vertex may be given for those at vertices.
-        n_training: how many shapes it was made of; None where the file does not say.
-        held_out: whether its variances hold for new shapes as they stand, as those of a Gaussian process do; those of
-            the shapes that the modes were found in do not.
-        provenance: what it was made from, in words.
-        licence: of the data, as far as the file or its format tells.
-        notes: sentences on what was kept, changed or left out.
+        mean: (V, 3) vertices for coefficients of zero, including the mean of the expressions.
+        shape: modes of the model, or of identity only if `expression` is given.
+        expression: modes of expression, which are added to those of identity, or None.
+        faces: (M, 3) triangles, counter-clockwise seen from outside, or None for a point model.
+        mm: length of the unit of the file, mm; None if the format does not state it, which is interpreted as 1 mm.
+        landmarks: named points on the surface, or a mapping of name to vertex for landmarks at vertices.
+        n_training: number of training shapes; None if the file does not state it.
+        held_out: whether the variances are valid for new shapes without correction, such as those of a Gaussian
+            process; False for variances of the training shapes.
+        provenance: description of the origin of the model.
+        licence: licence of the data, if the file or its format states it.
+        notes: sentences about converted, changed or omitted data.
     """
 
     mean: FloatArray
@@ -95,17 +96,17 @@ class LinearModel:
 
     @property
     def blocks(self) -> tuple[Modes, ...]:
-        """The modes of identity, and those of expression where there are any."""
+        """The modes of identity, and those of expression, if any."""
         return (self.shape,) if self.expression is None else (self.shape, self.expression)
 
     @property
     def moved(self) -> FloatArray:
-        """(3V, K) what one standard deviation of each mode does, those of identity first."""
+        """(3V, K) displacements of one standard deviation of each mode, identity modes first."""
         return np.concatenate([block.moved for block in self.blocks], axis=1)
 
     @property
     def total_variance(self) -> float | None:
-        """Of all modes, in the unit of the file squared; None if the file does not state it."""
+        """Variance of all modes, in the unit of the file squared; None if the file does not state it."""
         known = [block.total_variance for block in self.blocks if block.total_variance is not None]
         return sum(known) if known else None
 
@@ -114,10 +115,10 @@ class LinearModel:
         return replace(self, notes=(*self.notes, *notes))
 
     def check(self, path: Path) -> None:
-        """Refuse what is no model, whatever its format.
+        """Check that arrays of any format are a valid model.
 
         Raises:
-            ModelFileError: arrays that do not belong together or are not finite, or no modes.
+            ModelFileError: the arrays are inconsistent or not finite, or there are no modes.
         """
         blocks, n = self.blocks, len(self.mean)
         wrong = ""
@@ -127,24 +128,24 @@ class LinearModel:
             shapes = " and ".join(str(block.moved.shape) for block in blocks)
             wrong = f"its modes have the shape {shapes}, which {n} vertices do not"
         elif not all(are_measurable(array) for array in (self.mean, *(block.moved for block in blocks))):
-            wrong = "it holds numbers that are not finite, or too large for lengths"
+            wrong = "it contains numbers that are not finite, or too large for lengths"
         elif any(block.names and len(block.names) != block.moved.shape[1] for block in blocks):
             wrong = "it has another number of names than of modes"
         elif self.faces is not None and not are_triangles(self.faces, n):
-            wrong = f"its triangles are of the shape {self.faces.shape}, or name vertices that it does not have"
+            wrong = f"its triangles have the shape {self.faces.shape}, or refer to vertices that do not exist"
         elif bool((self.landmarks.corners >= n).any()):
-            wrong = "a landmark lies at a vertex that it does not have"
+            wrong = "a landmark refers to a vertex that does not exist"
         if wrong:
-            raise ModelFileError(f"{path} is no usable shape model: {wrong}; export it again from where it was made.")
+            raise ModelFileError(f"{path} is not a valid shape model: {wrong}; export it again with its program.")
 
 
 def are_triangles(faces: IntArray, n: int) -> bool:
-    """Whether `faces` is (F, 3) with indices of `n` vertices."""
+    """Return whether `faces` is (F, 3) with indices of `n` vertices."""
     return faces.ndim == 2 and faces.shape[1] == 3 and (not len(faces) or (faces.min() >= 0 and faces.max() < n))
 
 
 def are_measurable(array: FloatArray) -> bool:
-    """Whether all numbers are finite, and no larger than their squares and sums can be reckoned with."""
+    """Return whether all numbers are finite, and small enough for finite squares and sums."""
     return bool((np.abs(array) <= _LARGEST).all())
 
 
@@ -159,13 +160,13 @@ def orthonormal(displacements: FloatArray) -> tuple[FloatArray, FloatArray, Floa
     order = np.argsort(-length, kind="stable")
     keep = order[length[order] > _NO_STDDEV * length.max()] if length.size and length.max() > 0 else order[:0]
     unit = displacements[:, keep] / length[keep]
-    # The last bits hang on the number of threads, and workers, which have one, must find the same model.
+    # The last bits depend on the number of threads, and workers, which have one thread, must compute the same model.
     with threadpool_limits(1, user_api="blas"):
         if (
             np.abs(unit.T @ unit - np.eye(len(keep))).max(initial=0.0) <= ORTHOGONAL
             and len(keep) == displacements.shape[1]
         ):
-            # As it stands but for the rounding of single precision, so that modes stay the file's own.
+            # Orthonormal up to the rounding of single precision, so the modes of the file are kept.
             directions, upper = qr(unit, mode="economic")
             exact = np.asarray(directions * np.sign(np.diag(upper)), dtype=np.float64)
             return exact, length[keep], np.eye(displacements.shape[1])[:, keep]
@@ -178,12 +179,12 @@ def orthonormal(displacements: FloatArray) -> tuple[FloatArray, FloatArray, Floa
 def split_modes(
     displacements: FloatArray, names: Sequence[str], is_identity: Sequence[bool]
 ) -> tuple[Modes, Modes | None]:
-    """Return the modes (3V, K) of identity and of expression; all of them and None where they are of one kind.
+    """Return the modes (3V, K) of identity and of expression, or all modes and None without such a distinction.
 
     Args:
-        displacements: (3V, K).
-        names: (K,) or none.
-        is_identity: (K,) which are of identity, or none.
+        displacements: (3V, K) displacements of one standard deviation of each mode.
+        names: (K,) names of the modes, or empty.
+        is_identity: (K,) whether each mode is one of identity, or empty.
     """
     chosen = np.array(is_identity, dtype=np.bool_)
     if not 0 < chosen.sum() < displacements.shape[1]:
@@ -193,7 +194,7 @@ def split_modes(
 
 
 def facts_of(model: LinearModel) -> dict[str, Any]:
-    """Return what `with_facts` takes, with lengths in mm."""
+    """Return the metadata of a model for `with_facts`, with lengths in mm."""
     mm = model.mm or 1.0
     total = model.total_variance
     facts: dict[str, Any] = {
@@ -214,7 +215,7 @@ def facts_of(model: LinearModel) -> dict[str, Any]:
 def with_facts(model: LinearModel, facts: object) -> LinearModel:
     """Return `model` with the metadata in `facts`.
 
-    Landmarks are in triangles of vertices, so they are read only where the number of vertices is still the same.
+    Landmarks refer to triangles of vertices, so they are read only if the number of vertices is unchanged.
     """
     known = json_object(facts)
     if not known:
@@ -223,14 +224,14 @@ def with_facts(model: LinearModel, facts: object) -> LinearModel:
     landmarks, notes = model.landmarks, model.notes
     marks = json_object(known.get("landmarks"))
     if marks and known.get("vertices") != n:
-        notes = (*notes, "Its landmarks are left out: the number of vertices has changed since they were set.")
+        notes = (*notes, "Its landmarks are omitted, since the number of vertices has changed.")
     elif len(marks) <= _MOST_LANDMARKS:
         file_landmarks = _landmarks(marks, json_object(known.get(_PLACES)), n, model.mm or 1.0)
         landmarks = landmarks.select([name for name in landmarks if name not in file_landmarks]).joined(file_landmarks)
     training, total = _count(known.get("n_training")), known.get("total_variance_mm2")
     shape = model.shape
     if isinstance(total, float) and math.isfinite(total) and total > 0:
-        # Held by the shape alone, so that with expressions it is that of both.
+        # Stored in the shape only, so with expressions it is the variance of both.
         shape = replace(shape, total_variance=total / (model.mm or 1.0) ** 2)
     expression = model.expression
     if shape is not model.shape and expression is not None:
@@ -257,7 +258,7 @@ def _places_of(landmarks: SurfaceLandmarks, mm: float) -> dict[str, dict[str, An
 
 
 def _landmarks(vertices: Mapping[str, Any], places: Mapping[str, Any], n: int, mm: float) -> SurfaceLandmarks:
-    """Return the landmarks of facts: in their triangles where these are given, else at their vertices."""
+    """Return the landmarks of metadata: in their triangles if these are given, else at their vertices."""
     landmarks: list[SurfaceLandmarks] = []
     for name, value in vertices.items():
         vertex, entry = _count(value), json_object(places.get(name))
@@ -271,13 +272,13 @@ def _landmarks(vertices: Mapping[str, Any], places: Mapping[str, Any], n: int, m
             exact = SurfaceLandmarks((name,), corners, weights, distance)
             landmark = exact if dict(exact) == dict(landmark) and corners.max() < n else landmark
         except (KeyError, ValueError, TypeError, OverflowError):
-            pass  # not as `facts_of` writes it, which leaves the vertex
+            pass  # not in the form of `facts_of`; only the vertex is used
         landmarks.append(landmark)
     return SurfaceLandmarks().joined(*landmarks)
 
 
 def json_object(value: object) -> Mapping[str, Any]:
-    """Return `value` where it is an object of JSON, and an empty one otherwise."""
+    """Return `value` if it is a JSON object, and an empty object otherwise."""
     return cast(Mapping[str, Any], value) if isinstance(value, Mapping) else {}
 
 
@@ -290,17 +291,17 @@ def _words(value: object) -> str:
 
 
 def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
-    """Make the folder `path` with `files`, by their names.
+    """Create the folder `path` with `files` (name -> content).
 
     Raises:
-        InputError: there is such a folder, and something in it.
-        FileError: it cannot be made, or the disk is full.
+        InputError: the folder exists and is not empty.
+        FileError: it cannot be created, or the disk is full.
     """
     with writing(path):
         if path.exists() and (not path.is_dir() or any(path.iterdir())):
-            raise InputError(f"{path} is there already; give the name of a new folder.")
+            raise InputError(f"{path} already exists; give the name of a new folder.")
         path.parent.mkdir(parents=True, exist_ok=True)
-        # Beside it, so that one step puts it there.
+        # In the same parent folder, so that one rename moves it into place.
         with temporary_folder(path.parent) as temporary:
             complete = temporary / "whole"
             complete.mkdir()
@@ -313,17 +314,17 @@ def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
 
 @dataclass(frozen=True)
 class ModelReader:
-    """A model format that is read.
+    """A model format that can be read.
 
     Args:
-        name: by which `shapespace convert --to` asks for it.
-        title: in words, for messages.
-        suffixes: ends of names, lower case, the one that is written first; a folder's format has none that another
-            takes.
-        recognises: (path, head) -> whether the path, which begins with `head` (empty for a folder), looks like it;
-            cheap, never raises.
-        read: path -> the model in it. It raises FileError where it cannot be read, and ModelFileError where it is
-            damaged, made to harm, or another thing.
+        name: name of the format for `shapespace convert --to`.
+        title: description of the format, used in messages.
+        suffixes: endings of file names, lower case; the first is used for writing. A format that is a folder has no
+            ending of another format.
+        recognises: function (path, head) -> whether the path looks like this format; `head` are the first bytes, empty
+            for a folder. It is fast and never raises.
+        read: function path -> model. It raises FileError if the file cannot be read, and ModelFileError if it is
+            damaged, malicious, or has another format.
     """
 
     name: str
@@ -335,12 +336,12 @@ class ModelReader:
 
 @dataclass(frozen=True)
 class ModelFormat(ModelReader):
-    """A model format that is read and written.
+    """A model format that can be read and written.
 
     Args:
-        name, title, suffixes, recognises, read: of `ModelReader`.
-        write: (model, path) -> sentences on what was changed or left out; it writes a whole file or none. It raises
-            FileError where it cannot be written, and InputError where the format cannot hold such a model.
+        name, title, suffixes, recognises, read: the fields of `ModelReader`.
+        write: function (model, path) -> sentences about changed or omitted data; it writes atomically. It raises
+            FileError if the file cannot be written, and InputError if the format cannot store the model.
     """
 
     write: Callable[[LinearModel, Path], Sequence[str]]

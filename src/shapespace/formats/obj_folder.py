@@ -29,18 +29,18 @@ from shapespace.types import FloatArray, Mesh, are_same_triangles
 
 _ICT: Final = "generic_neutral_mesh"
 _ICT_MM = 10.0
-"""ICT-FaceKit is in cm."""
+"""Length of the unit of ICT-FaceKit, cm, in mm."""
 _NEUTRALS: Final = (_ICT, "neutral", "neutral_mesh")
 _FACTS = f"{KEY}.json"
 _LICENCES = ("LICENSE", "LICENSE.txt", "LICENSE.md", "LICENCE", "LICENCE.txt")
 _MOST_LICENCE_BYTES = 2**16  # 64 KiB
-_LOOKED_AT_BYTES = 2**26  # 64 MiB
+_PROBED_BYTES = 2**26  # 64 MiB
 _MOST_SHAPES = 4096  # limit on files that are opened
-_AGAIN = "export all of them again with the same vertices and triangles"
+_AGAIN = "export all files again with the same vertices and triangles"
 
 
 def is_obj_folder(path: Path, head: bytes) -> bool:
-    """Whether one OBJ file there is called neutral and another has as many vertices and faces."""
+    """Return whether a folder has an OBJ file called neutral and another one with as many vertices and faces."""
     try:
         neutral, mode_files = _files(path)
         if neutral is None or not mode_files:
@@ -51,11 +51,11 @@ def is_obj_folder(path: Path, head: bytes) -> bool:
 
 
 def read_obj_folder(path: Path) -> LinearModel:
-    """Read a folder with a neutral mesh, `identity000.obj` and so on, and `<expression>.obj`, all of one topology."""
+    """Read a folder with a neutral mesh, `identity000.obj` and so on, and `<expression>.obj`, with equal triangles."""
     neutral, mode_files = _files(path)
     if neutral is None or not mode_files or len(mode_files) > _MOST_SHAPES:
         raise ModelFileError(
-            f"{path} is no folder of blendshapes: it needs one OBJ file called neutral or {_ICT}, and 1 to "
+            f"{path} is not a folder of blendshapes: it needs one OBJ file called neutral or {_ICT}, and 1 to "
             f"{_MOST_SHAPES} others."
         )
     neutral_mesh = read_mesh(neutral)
@@ -64,8 +64,7 @@ def read_obj_folder(path: Path) -> LinearModel:
         shape = read_mesh(file)
         if len(shape.vertices) != len(neutral_mesh.vertices) or not are_same_triangles(shape.faces, neutral_mesh.faces):
             raise ModelFileError(
-                f"{file} has other vertices or triangles than {neutral.name}, so that they are no blendshapes; "
-                f"{_AGAIN}."
+                f"{file} has other vertices or triangles than {neutral.name}, so they are not blendshapes; {_AGAIN}."
             )
         steps.append((shape.vertices - neutral_mesh.vertices).ravel())
     names = [file.stem for file in mode_files]
@@ -74,7 +73,7 @@ def read_obj_folder(path: Path) -> LinearModel:
     facts = json_object(read_json(path / _FACTS, "remove it") if (path / _FACTS).is_file() else None)
     notes: list[str] = []
     if not facts:
-        notes.append("Each shape is taken as one standard deviation of its mode.")
+        notes.append("Each shape is interpreted as one standard deviation of its mode.")
     ict = neutral.stem.lower() == _ICT
     return with_facts(
         LinearModel(
@@ -92,7 +91,7 @@ def read_obj_folder(path: Path) -> LinearModel:
 
 
 def write_obj_folder(model: LinearModel, path: Path) -> Sequence[str]:
-    """As `ModelFormat.write`; a new folder, in mm."""
+    """Write a new folder, in mm, see `ModelFormat.write`."""
     mm = model.mm or 1.0
     mean_mm = model.mean * mm
     files = {f"{_ICT}.obj": write_obj(Mesh(mean_mm, model.faces))}
@@ -122,7 +121,7 @@ def _files(folder: Path) -> tuple[Path | None, list[Path]]:
 
 def _counts(path: Path) -> tuple[int, int]:
     """Return approximate numbers of vertices and faces of an OBJ file, without parsing it."""
-    content = b"\n" + read_bytes(path, _LOOKED_AT_BYTES)
+    content = b"\n" + read_bytes(path, _PROBED_BYTES)
     return content.count(b"\nv "), content.count(b"\nf ")
 
 

@@ -22,8 +22,8 @@ from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import open_file
 
 MODEL_FORMATS: Mapping[str, ModelFormat] = {
-    one.name: one
-    for one in (
+    entry.name: entry
+    for entry in (
         ModelFormat("eos", "eos .bin", (".bin",), is_eos, read_eos, write_eos),
         ModelFormat(
             "statismo", "statismo/scalismo HDF5", (".statismo.h5",), is_statismo, read_statismo, write_statismo
@@ -43,23 +43,23 @@ MODEL_FORMATS: Mapping[str, ModelFormat] = {
         ),
     )
 }
-"""Formats that are read and written, by their names, in the order in which they are asked whether a file is theirs."""
+"""Formats that can be read and written, by name, in the order of detection."""
 READ_ONLY_MODELS: Mapping[str, ModelReader] = {
-    one.name: one
-    for one in (
+    entry.name: entry
+    for entry in (
         ModelReader("gias", "GIAS2 .pc.npz", (".pc.npz",), is_gias, read_gias),
         ModelReader("flame", "FLAME/SMPL .npz and .pkl", (".npz", ".pkl"), is_flame, read_flame),
         ModelReader("mat", "BFM 2009, LSFM and LYHM .mat", (".mat",), is_matlab, read_matlab),
         ModelReader("monai-physio", "MONAI-Physio", (), is_monai, read_monai),
     )
 }
-"""Those that are only read, which are asked next."""
+"""Formats that can only be read, by name; they follow in the order of detection."""
 LARGEST_BYTES = 2**34  # 16 GiB
-_HEAD_BYTES = 4096  # signatures and first fields of every format lie within it
+_HEAD_BYTES = 4096  # contain the signature and first fields of every format
 
 
 def read_linear(path: Path) -> tuple[ModelReader, LinearModel]:
-    """Return the format of `path`, and the model in it.
+    """Return the format of `path`, and the model that it contains.
 
     Raises:
         FileError: it cannot be read.
@@ -70,7 +70,7 @@ def read_linear(path: Path) -> tuple[ModelReader, LinearModel]:
     if model_format is None:
         known = ", ".join(reader.title for reader in _readers())
         raise ModelFileError(f"{path} is in no format of shape models that shapespace reads: its own, {known}.")
-    # The last bits hang on the number of threads, and workers, which have one, must find the same model.
+    # The last bits depend on the number of threads, and workers, which have one thread, must compute the same model.
     with threadpool_limits(1, user_api="blas"), np.errstate(invalid="ignore", over="ignore"):
         model = model_format.read(path)
     model.check(path)
@@ -78,15 +78,15 @@ def read_linear(path: Path) -> tuple[ModelReader, LinearModel]:
 
 
 def is_known(path: Path) -> bool:
-    """Whether `path` looks like a model in one of these formats."""
+    """Return whether `path` looks like a model in one of these formats."""
     return (path.is_file() or path.is_dir()) and _format_of(path) is not None
 
 
 def format_to_write(path: Path, name: str | None) -> ModelFormat:
-    """Return the format called `name`, or the one whose names end as `path` does.
+    """Return the format called `name`, or the format with the ending of `path`.
 
     Raises:
-        InputError: there is none, or it is only read.
+        InputError: there is no such format, or it can only be read.
     """
 
     def is_meant(candidate: ModelReader) -> bool:
@@ -95,9 +95,9 @@ def format_to_write(path: Path, name: str | None) -> ModelFormat:
     if (meant := next(filter(is_meant, MODEL_FORMATS.values()), None)) is not None:
         return meant
     if (read_only := next(filter(is_meant, READ_ONLY_MODELS.values()), None)) is not None:
-        problem = f"Cannot write {path}: {read_only.title} is only read"
+        problem = f"Cannot write {path}: {read_only.title} can only be read"
     else:
-        problem = f"There is no format {name!r}" if name else f"The name {path.name!r} names no format"
+        problem = f"There is no format {name!r}" if name else f"The ending of {path.name!r} is not that of a format"
     names = ", ".join(
         f"{writer.name} ({writer.suffixes[0]})" if writer.suffixes else writer.name for writer in MODEL_FORMATS.values()
     )

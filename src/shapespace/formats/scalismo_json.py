@@ -20,7 +20,7 @@ from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import atomic_path, read_bytes
 from shapespace.io.sandbox import SandboxError, Tree
 
-_AGAIN = "export it again from where it was made"
+_AGAIN = "export it again from the original program"
 _LARGEST_BYTES = 2**31  # 2 GiB
 _MOST_NODES = 4096  # limit on damaged files; models have tens
 _DEEPEST = 16  # limit on damaged files; models have three levels
@@ -38,7 +38,7 @@ _SCALAR: Final = {"class": "H5S_SCALAR"}
 
 
 def is_scalismo_json(path: Path, head: bytes) -> bool:
-    """Whether it begins as JSON, and is named as scalismo names it or begins as HDF5/JSON does."""
+    """Return whether a file begins like JSON, and has the ending of scalismo or the beginning of HDF5/JSON."""
     start = head.lstrip()
     if not start.startswith(b"{"):
         return False
@@ -46,13 +46,13 @@ def is_scalismo_json(path: Path, head: bytes) -> bool:
 
 
 def read_scalismo_json(path: Path) -> LinearModel:
-    """Read HDF5/JSON, the one format that scalismo writes from 0.92 on, whether named `.json` or `.h5`."""
+    """Read HDF5/JSON, the only format that scalismo writes from 0.92 on, with the ending `.json` or `.h5`."""
     check_file(path, _LARGEST_BYTES, _AGAIN)
     try:
         tree = _tree(read_bytes(path))
     except (ValueError, OverflowError, RecursionError, MemoryError) as error:
         message = " ".join(str(error).split())[:120].rstrip(".")
-        raise ModelFileError(f"{path} is damaged, or no HDF5/JSON: {message}; {_AGAIN}.") from error
+        raise ModelFileError(f"{path} is damaged, or not HDF5/JSON: {message}; {_AGAIN}.") from error
     return model_of(tree, path)
 
 
@@ -98,7 +98,7 @@ def _tree(text: bytes) -> Tree:
     """Return the tree of linked objects from the root; objects without a link are ignored.
 
     Raises:
-        ValueError: it is no such file, as a clause.
+        ValueError: it is not such a file; the message is a clause.
     """
     file = msgspec.json.decode(text, type=_File)
     arrays: dict[str, npt.NDArray[Any]] = {}
@@ -111,7 +111,7 @@ def _tree(text: bytes) -> Tree:
         if known_as not in file.groups:
             raise SandboxError(f"there is no group {path or '/'} in it")
         if len(groups) + len(arrays) + len(waiting) > _MOST_NODES or path.count("/") > _DEEPEST:
-            raise SandboxError("it has more groups than a model")
+            raise SandboxError("it has more groups than any model")
         group = file.groups[known_as]
         groups.append(path or "/")
         attributes[path or "/"] = _attributes(group.attributes)
@@ -125,7 +125,7 @@ def _tree(text: bytes) -> Tree:
                 dataset = file.datasets[link.id]
                 left -= len(bytes(dataset.value))
                 if left < 0:
-                    raise SandboxError("it links to the same values again and again")
+                    raise SandboxError("it links to the same values too often")
                 attributes[inner] = _attributes(dataset.attributes)
                 value = _value(dataset, inner)
                 if isinstance(value, str):
@@ -136,26 +136,26 @@ def _tree(text: bytes) -> Tree:
 
 
 def _attributes(entries: Sequence[_Attribute]) -> dict[str, Any]:
-    """Return numbers and texts by name; converters of HDF5 files write single ones as lists of one."""
+    """Return numbers and texts by name; converters of HDF5 files write single values as lists with one item."""
     values: dict[str, Any] = {}
     for entry in entries:
-        value = _single(entry.value)
+        value = _unwrap_lists(entry.value)
         if isinstance(value, str | int | float):
             values[entry.name] = value.rstrip("\0") if isinstance(value, str) else value
     return values
 
 
 def _value(dataset: _Dataset, path: str) -> npt.NDArray[Any] | str | None:
-    """Return what a data set holds: numbers, a text, or None for anything else."""
-    kind = str(_of(dataset.type, "class"))
-    base = str(_of(dataset.type, "base"))
+    """Return the content of a data set: numbers, a text, or None for other types."""
+    kind = str(_get_item(dataset.type, "class"))
+    base = str(_get_item(dataset.type, "base"))
     if kind == "H5T_STRING":
-        value = _single(msgspec.json.decode(dataset.value))
+        value = _unwrap_lists(msgspec.json.decode(dataset.value))
         return value.rstrip("\0") if isinstance(value, str) else None
     if kind not in ("H5T_FLOAT", "H5T_INTEGER"):
         return None
     number_type: Any = int if kind == "H5T_INTEGER" else float
-    dims = _of(dataset.shape, "dims")
+    dims = _get_item(dataset.shape, "dims")
     shape = cast(list[Any], dims) if isinstance(dims, list) else []
     if len(shape) > 2 or not all(isinstance(size, int) and size >= 0 for size in shape):
         return None
@@ -164,24 +164,24 @@ def _value(dataset: _Dataset, path: str) -> npt.NDArray[Any] | str | None:
     typed = number_type if not shape else list[number_type] if len(shape) == 1 else list[list[number_type]]
     array = np.array(msgspec.json.decode(dataset.value, type=typed, strict=True))
     if array.shape != tuple(shape) or array.dtype.kind not in "iuf":
-        raise SandboxError(f"{path} is cut short, or not of the shape {shape} that it says")
-    # Characters of legacy VTK files are such numbers.
+        raise SandboxError(f"{path} is cut short, or does not have its declared shape {shape}")
+    # Characters of legacy VTK files are stored as such numbers.
     return array.astype(np.uint8) if base.endswith(("I8LE", "U8LE", "I8BE", "U8BE")) else array
 
 
-def _single(value: Any) -> Any:
-    """Return what lists of one hold."""
+def _unwrap_lists(value: Any) -> Any:
+    """Return the innermost value of nested lists with one item."""
     while isinstance(value, list) and len(cast(list[Any], value)) == 1:
         value = cast(list[Any], value)[0]
     return cast(Any, value)
 
 
-def _of(value: Any, key: str) -> Any:
+def _get_item(value: Any, key: str) -> Any:
     return cast(dict[str, Any], value).get(key) if isinstance(value, dict) else None
 
 
 def _text_of(tree: Tree) -> Generator[str]:
-    """Yield the file in pieces; attributes and texts are scalars, since scalismo reads no lists of one."""
+    """Yield the file in pieces; attributes and texts are scalars, since scalismo does not read lists with one item."""
     paths = (*tree.groups, *tree.arrays, *tree.texts)
     known_as = {path: str(uuid.uuid5(uuid.NAMESPACE_URL, f"shapespace:{path}")) for path in paths}
     inside: dict[str, list[str]] = {path: [] for path in tree.groups}

@@ -1,4 +1,4 @@
-"""ShapeWorks: a project (`.swproj` or `.xlsx`) whose subjects have corresponding particles, and meshes perhaps.
+"""ShapeWorks: a project (`.swproj` or `.xlsx`) of subjects with corresponding particles, and optionally meshes.
 
 Keys and columns as ShapeWorks 6 writes them (Libs/Project): `world_particles_D` and `local_particles_D` of each domain
 D, text files of `x y z` rows, and `groomed_D`, the surface on which the local particles lie.
@@ -32,7 +32,7 @@ from shapespace.io.read_limits import LARGEST_MESH_FILE_BYTES, Allowance
 from shapespace.io.tables.workbook import sheet_rows
 from shapespace.types import FloatArray, IntArray, Mesh
 
-_AGAIN = "run optimize in ShapeWorks again, or copy its folder of particles beside the project"
+_AGAIN = "run optimize in ShapeWorks again, or copy its folder of particles to the folder of the project"
 _LARGEST_PROJECT_BYTES = 2**26  # 64 MiB
 _PARTICLES = re.compile(r"(world|local)_particles_(.+)")
 _SURFACES = ("groomed", "shape", "mesh")
@@ -46,20 +46,20 @@ _BATCH = 512
 _MOST_CARRIED_BYTES = 2**31
 """Memory of the modes of a carried mesh (2 GiB)."""
 _MOST_APART = 0.02
-"""Of the size of a shape: further from its mesh, the particles are those of another."""
+"""Share of the size of a shape; particles at a larger distance from its mesh belong to another shape."""
 _IDENTITY = " ".join(str(value) for value in np.eye(4).ravel())
 
 Row = Mapping[str, str]
 
 
 def is_shapeworks(path: Path, head: bytes) -> bool:
-    """Whether it is called a project and begins as JSON or as a workbook does."""
+    """Return whether a file has the ending of a project and begins like JSON or a workbook."""
     begin = {".swproj": b"{", ".xlsx": b"PK"}.get(path.suffix.lower())
     return begin is not None and head.lstrip()[: len(begin)] == begin
 
 
 def read_shapeworks(path: Path) -> LinearModel:
-    """Read the particles of all subjects as a model, on the mesh of the most average one where there are meshes."""
+    """Read the particles of all subjects as a model, on the mesh of the subject nearest to the mean, if any."""
     check_file(path, _LARGEST_PROJECT_BYTES, _AGAIN)
     content = read_bytes(path)
     facts: Mapping[str, Any] = {}
@@ -73,13 +73,13 @@ def read_shapeworks(path: Path) -> LinearModel:
 
 
 def write_shapeworks(model: LinearModel, path: Path) -> Sequence[str]:
-    """As `ModelFormat.write`; vertices become particles, the model as many shapes as have its mean and covariance.
+    """Write vertices as particles, and the model as shapes with its mean and covariance, see `ModelFormat.write`.
 
     K modes take K + 1 shapes, none further than 1.42 standard deviations in any mode: the rows of a cosine
     transform, which sum to zero and are orthogonal.
     """
     if path.suffix.lower() == ".xlsx":
-        raise InputError(f"{path} cannot be written: workbooks are only read; give a name that ends in .swproj.")
+        raise InputError(f"{path} cannot be written: workbooks can only be read; give a name that ends in .swproj.")
     displacements = model.moved * (model.mm or 1.0)
     mean = model.mean * (model.mm or 1.0)
     count = displacements.shape[1] + 1
@@ -107,7 +107,7 @@ def write_shapeworks(model: LinearModel, path: Path) -> Sequence[str]:
         f"Each of the {len(mean)} vertices is a particle, in mm.",
     ]
     if model.expression is not None:
-        notes.append("Identity and expression are no longer apart.")
+        notes.append("Identity and expression are no longer separate.")
     return notes
 
 
@@ -120,19 +120,19 @@ class _Project:
     known: set[Path] = field(default_factory=lambda: set[Path]())
 
     def file(self, name: str) -> Path:
-        """Return the file of that name beside the project or in a folder there, counted the first time."""
+        """Return the path of a file in the folder of the project or below, and count the file at its first use."""
         folder = self.path.parent.resolve()
         try:
             target = (folder / PurePosixPath(name.strip().replace("\\", "/"))).resolve()
             is_there = target.is_file()
-        except (OSError, ValueError) as error:  # a name too long for the system, or one with zeros
-            raise ModelFileError(f"{self.path} names a file that cannot be ({name[:80]!r}); {_AGAIN}.") from error
+        except (OSError, ValueError) as error:  # a name that is too long, or contains null characters
+            raise ModelFileError(f"{self.path} names a file with an invalid name ({name[:80]!r}); {_AGAIN}.") from error
         if not target.is_relative_to(folder):
             raise ModelFileError(
-                f"{self.path} names a file outside its own folder ({name[:80]!r}), which is not read; move it there."
+                f"{self.path} names a file outside its folder ({name[:80]!r}), which is not read; move it there."
             )
         if not is_there:
-            raise ModelFileError(f"{self.path} names a file that is not there ({name[:80]!r}); {_AGAIN}.")
+            raise ModelFileError(f"{self.path} names a file that does not exist ({name[:80]!r}); {_AGAIN}.")
         if target not in self.known:
             self.known.add(target)
             self.allowance.more_file(target.stat().st_size)
@@ -145,9 +145,9 @@ class _Project:
         if file not in self.read:
             values = floats_of(read_bytes(file, LARGEST_MESH_FILE_BYTES), file)
             if not len(values) or len(values) % 3 or not np.isfinite(values).all():
-                raise ModelFileError(f"{file} does not hold rows of three finite numbers; {_AGAIN}.")
+                raise ModelFileError(f"{file} does not contain rows of three finite numbers; {_AGAIN}.")
             self.read[file] = values.reshape(-1, 3)
-        # Many subjects may name one file, and each becomes a row of its own.
+        # Several subjects may refer to one file; each becomes a row.
         self.allowance.take(self.read[file].size, 8)
         return self.read[file]
 
@@ -164,7 +164,7 @@ def _model(project: _Project) -> LinearModel:
     shapes = np.stack([np.concatenate(subject) for subject in parts])
     notes: list[str] = []
     if len(rows) < len(project.rows):
-        notes.append(f"{len(project.rows) - len(rows)} subjects without particles are left out.")
+        notes.append(f"{len(project.rows) - len(rows)} subjects without particles are omitted.")
     if len(domains) > 1:
         notes.append(f"Its {len(domains)} domains vary together in one model.")
     if kind == "local":
@@ -174,7 +174,7 @@ def _model(project: _Project) -> LinearModel:
     mean = flat.mean(axis=0)
     _, stddev, directions = np.linalg.svd((flat - mean) / np.sqrt(len(flat) - 1), full_matrices=False)
     modes = directions.T * stddev
-    # One less than there are subjects; the last is rounding.
+    # One less than the number of subjects; the last mode is rounding.
     displacements = modes[:, : len(flat) - 1]
     surface = _surface(project, rows, domains, shapes, mean.reshape(-1, 3), counts)
     points: FloatArray = mean.reshape(-1, 3)
@@ -212,7 +212,7 @@ def _domains(project: _Project) -> tuple[str, list[str]]:
     for kind, domains in names_by_space.items():
         if domains:
             return kind, domains
-    raise ModelFileError(f"{project.path} names no particles; {_AGAIN}.")
+    raise ModelFileError(f"{project.path} contains no paths of particles; {_AGAIN}.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,9 +220,9 @@ class _Surface:
     """Mesh of a subject.
 
     Args:
-        subject: its name.
-        faces: (M, 3).
-        carry: for each domain the particles of that subject (P, 3) and its mesh (V, 3), or None where the particles are
+        subject: name of the subject.
+        faces: (M, 3) triangles of the mesh.
+        carry: particles (P, 3) and mesh vertices (V, 3) of the subject for each domain, or None if the particles are
             the vertices.
     """
 
@@ -231,7 +231,10 @@ class _Surface:
     carry: Sequence[tuple[FloatArray, FloatArray]] | None
 
     def carried(self, mean: FloatArray, displacements: FloatArray) -> tuple[FloatArray, FloatArray] | str:
-        """Return the vertices (V, 3) and modes (3V, K) that the particles `mean` and their modes carry, or why not."""
+        """Return the vertices (V, 3) and modes (3V, K) interpolated from the particles `mean` and their modes.
+
+        If this is impossible, return the reason as a clause.
+        """
         if 24 * sum(len(mesh) for _, mesh in self.carry or ()) * (1 + displacements.shape[1]) > _MOST_CARRIED_BYTES:
             return f"its modes on the mesh of {self.subject} would take more than {_MOST_CARRIED_BYTES >> 30} GiB"
         steps = displacements.reshape(len(mean), -1)
@@ -239,12 +242,12 @@ class _Surface:
         for particles, mesh in self.carry or ():
             rows = slice(start, start + len(particles))
             start += len(particles)
-            # Splines are linear in what the particles do, so that the model stays a linear one.
+            # Splines are linear in the displacements of the particles, so the model remains linear.
             particle_values = np.concatenate([mean[rows] - particles, steps[rows]], axis=1)
             try:
                 carried_values = interpolate_displacements(particles, particle_values, mesh)
             except np.linalg.LinAlgError:
-                return "its particles lie in a plane or nearly coincide, so that they carry no mesh"
+                return "its particles lie in a plane or nearly coincide, so a mesh cannot be interpolated"
             vertices.append(mesh + carried_values[:, :3])
             modes.append(carried_values[:, 3:].reshape(3 * len(mesh), -1))
         return np.concatenate(vertices), np.concatenate(modes)
@@ -309,7 +312,7 @@ def _surface(
     mean: FloatArray,
     counts: Sequence[int],
 ) -> _Surface | str:
-    """Return the mesh of the subject nearest to the mean, or why there is none, as a clause."""
+    """Return the mesh of the subject nearest to the mean, or the reason why there is none, as a clause."""
     number = int(((shapes - mean) ** 2).sum(axis=(1, 2)).argmin())
     row, points = rows[number], shapes[number]
     bounds = np.cumsum([0, *counts])
@@ -319,7 +322,7 @@ def _surface(
     for k, domain in enumerate(domains):
         name = next((row[f"{key}_{domain}"] for key in _SURFACES if row.get(f"{key}_{domain}")), "")
         if not name.lower().endswith(tuple(MESH_ENDINGS)):
-            return "the project names no mesh"
+            return "the project contains no mesh"
         world = points[bounds[k] : bounds[k + 1]]
         try:
             mesh = read_mesh(project.file(name))
@@ -333,14 +336,14 @@ def _surface(
             else:
                 distance = 0.0
         except ShapespaceError as error:
-            # A project without its meshes is a model still.
+            # A project is a valid model without its meshes.
             return f"the mesh of the most average subject cannot be used ({str(error).rstrip('.')[:160]})"
         size = float(np.ptp(world, axis=0).max())
         if mesh.faces is None:
             return "the mesh of the most average subject has no triangles"
         gap = np.maximum(vertices.min(axis=0) - world.min(axis=0), world.max(axis=0) - vertices.max(axis=0))
         if distance > _MOST_APART * size or float(gap.max()) > _MOST_APART * size:
-            return "the mesh of the most average subject does not lie where its particles are"
+            return "the mesh of the most average subject does not match its particles"
         is_vertices = vertices.shape == world.shape and np.abs(vertices - world).max() <= _ON_PARTICLES * size
         exact = exact and bool(is_vertices)
         pairs.append((world, vertices))
@@ -351,7 +354,7 @@ def _surface(
     if exact:
         return _Surface(subject, all_faces, None)
     if any(len(np.unique(world, axis=0)) < len(world) or len(world) < 5 for world, _ in pairs):
-        return "particles coincide or are too few to carry a mesh"
+        return "particles coincide or are too few to interpolate a mesh"
     return _Surface(subject, all_faces, pairs)
 
 
@@ -361,9 +364,9 @@ def _rows(data: object) -> list[Row]:
 
 
 def _sheet(content: bytes, path: Path) -> list[Row]:
-    """Return the rows of the sheet `data` of a workbook, by their headings."""
+    """Return the rows of the sheet `data` of a workbook as dictionaries by column name."""
     try:
         table = sheet_rows(content, "data")
     except ValueError as error:
-        raise ModelFileError(f"{path} {error}, so it is no project of ShapeWorks; {_AGAIN}.") from error
+        raise ModelFileError(f"{path} {error}, so it is not a project of ShapeWorks; {_AGAIN}.") from error
     return [{table[0][column]: text for column, text in cells.items() if column in table[0]} for cells in table[1:]]

@@ -1,8 +1,8 @@
-"""statismo and scalismo models in HDF5, and the tree of groups that both of their containers share.
+"""statismo and scalismo models in HDF5, and the tree of groups that HDF5 and HDF5/JSON files have in common.
 
-Dialects differ in how texts, attributes and sizes are stored, in whether a column of the basis is of length 1, and in
-where the points are; all are recognised by what the tree contains. A Morphable Model (Basel Face Model,
-scalismo-faces) is three such models in one: shape, colour, expression. Models are written as version 0.9.
+Dialects differ in the storage of texts, attributes and sizes, in the length of the columns of the basis, and in the
+location of the points; they are recognised from the content of the tree. A Morphable Model (Basel Face Model,
+scalismo-faces) consists of three such models: shape, colour, expression. Models are written as version 0.9.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ from shapespace.io.meshes.vtk import read_vtk
 from shapespace.io.sandbox import HDF5_SIGNATURE, SandboxError, Tree, read_hdf5_sandboxed
 from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks
 
-_AGAIN = "export it again from where it was made"
+_AGAIN = "export it again from the original program"
 _LARGEST_BYTES = 2**31  # 2 GiB
 _POINTS_AT = 1e-3
-"""Share of the extent of the model; landmarks farther from its surface are left out."""
+"""Share of the extent of the model; landmarks at a larger distance from its surface are omitted."""
 _SINGLE = 2e-6
 """Share of the size of the model by which single precision may move a point."""
 _UNIT_LENGTH = 1e-2  # deviation of a column's norm from 1 from which the basis counts as scaled
@@ -49,18 +49,18 @@ _LEGACY_CELLS = "representer/reference-mesh/triangle-list"
 _OUTER: Final = ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))
 """Sides of a tetrahedron, counter-clockwise from outside where its volume is positive."""
 _PARAMETERS: Final = "modelinfo/modelBuilder-0/parameters"
-"""Texts by name in each model, where we leave what statismo has no place for."""
+"""Group of texts in each model for metadata for which statismo has no field."""
 _GREY = 0.5  # mean colour of a model without colours, of 0 to 1
-_LEFT_OUT = 1e-6  # relative; rounding in single precision
+_OMITTED = 1e-6  # relative; rounding in single precision
 
 
 def is_statismo(path: Path, head: bytes) -> bool:
-    """Whether it begins as HDF5."""
+    """Return whether a file begins like HDF5."""
     return head.startswith(HDF5_SIGNATURE)
 
 
 def read_statismo(path: Path) -> LinearModel:
-    """Read HDF5 as statismo, scalismo up to 0.91, gravis and the Basel Face Model write it."""
+    """Read HDF5 files of statismo, scalismo up to 0.91, gravis and the Basel Face Model."""
     check_file(path, _LARGEST_BYTES, _AGAIN)
     try:
         return model_of(read_hdf5_sandboxed(path, leave=("/color",)), path)
@@ -69,7 +69,7 @@ def read_statismo(path: Path) -> LinearModel:
 
 
 def write_statismo(model: LinearModel, path: Path) -> Sequence[str]:
-    """As `ModelFormat.write`; version 0.9, single precision, a Morphable Model where there are expressions."""
+    """Write version 0.9 in single precision, with expressions a Morphable Model, see `ModelFormat.write`."""
     tree, notes = tree_of(model)
     write_bytes(path, _hdf5_of(tree))
     return notes
@@ -79,18 +79,18 @@ def model_of(tree: Tree, path: Path) -> LinearModel:
     """Return the model in `tree`.
 
     Args:
-        tree: of the file.
-        path: of the file, for messages.
+        tree: content of the file.
+        path: path of the file, used in messages.
 
     Raises:
-        ModelFileError: it holds none, or one of images, or parts that do not belong together.
+        ModelFileError: it contains no model, a model of images, or inconsistent parts.
     """
     try:
         return _model(tree, path)
     except (ValueError, KeyError, OverflowError) as error:
         if isinstance(error, ShapespaceError):
             raise
-        raise ModelFileError(f"{path} is no usable statismo model: {error}; {_AGAIN}.") from error
+        raise ModelFileError(f"{path} is not a valid statismo model: {error}; {_AGAIN}.") from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +116,7 @@ def _model(tree: Tree, path: Path) -> LinearModel:
             raise ValueError("its expressions have another number of vertices than its shape")
         mean, expression = mean + added.mean, added.modes()
     if "/color" in tree.groups:
-        notes.append("Its model of colour is left out.")
+        notes.append("Its colour model is omitted.")
     parameters = _parameters(tree, root)
     points, faces, used_rows = _surface(tree, root, mean.reshape(-1, 3), notes)
     shape = part.modes()
@@ -133,7 +133,7 @@ def _model(tree: Tree, path: Path) -> LinearModel:
         mm=_mm(tree, root, parameters),
         landmarks=_landmarks(tree, (points, mean.reshape(-1, 3)), faces, notes, path),
         n_training=_n_training(tree, root, part, parameters),
-        # Not so of Gaussian processes: fits that took their variances as they stand were too sure of themselves.
+        # False for Gaussian processes: fits with their uncorrected variances were overconfident.
         held_out=parameters.get("held_out") == "yes",
         provenance=parameters.get("provenance") or " ".join(f"statismo model {representer}".split()),
         licence=parameters.get("licence") or (_BFM_LICENCE if is_bfm else ""),
@@ -142,7 +142,7 @@ def _model(tree: Tree, path: Path) -> LinearModel:
 
 
 def _roots(tree: Tree) -> list[str]:
-    """Return where the catalogue says that models are, without doubled slashes."""
+    """Return the paths of models in the catalogue, without doubled slashes."""
     paths = [text for path, text in tree.texts.items() if path.startswith("/catalog/") and path.endswith("/modelPath")]
     return ["/" + "/".join(part for part in text.split("/") if part) for text in paths]
 
@@ -152,8 +152,8 @@ def _root(tree: Tree, path: Path) -> str:
         if f"{root}/model/mean" in tree.arrays:
             return root
     if tree.attributes.get("/", {}).get("format") == "shapespace model":
-        raise ValueError("it is one of shapespace, but has no checksum")
-    raise ModelFileError(f"{path} is not a shapespace model, nor one of statismo: there is no /model/mean in it.")
+        raise ValueError("it is a shapespace model, but has no checksum")
+    raise ModelFileError(f"{path} is not a shapespace model or a statismo model: it has no /model/mean.")
 
 
 def _version(tree: Tree, root: str) -> tuple[int, int] | None:
@@ -181,18 +181,18 @@ def _part(tree: Tree, root: str) -> _ModelBlock:
     version = _version(tree, root)
     length = np.linalg.norm(basis, axis=0)
     if version is None:
-        # 0.8 had no number either; a file of others without one may have columns of length 1.
+        # Version 0.8 has no version number; files of other tools without a number may have columns of length 1.
         is_scaled = bool(np.abs(length - 1).max() > _UNIT_LENGTH)
     elif version == (0, 8):
         is_scaled = True
     elif version[0] == 1 or version in ((0, 9), (0, 91)):
         is_scaled = False
     else:
-        raise ValueError(f"it is of version {version[0]}.{version[1]}, and 0.8, 0.9 and 1 are known")
+        raise ValueError(f"it is of version {version[0]}.{version[1]}, and 0.8, 0.9 and 1 are supported")
     unit = basis / np.where(is_scaled & (length > 0), length, 1.0)
     is_used = length > 0
     skew = np.abs(unit[:, is_used].T @ unit[:, is_used] - np.eye(int(is_used.sum()))).max(initial=0.0)
-    # The file has variances less the noise, which every direction has.
+    # The variances in the file exclude the noise, which is added to every direction.
     n_orthogonal = len(variance) if skew <= ORTHOGONAL else 0
     displacements = scale_columns(unit, np.sqrt(variance + (noise if n_orthogonal else 0.0)))
     return _ModelBlock(mean, displacements, noise * (len(mean) - n_orthogonal))
@@ -207,12 +207,12 @@ def _array(tree: Tree, path: str) -> FloatArray:
 def _surface(
     tree: Tree, root: str, mean: FloatArray, notes: list[str]
 ) -> tuple[FloatArray, IntArray | None, npt.NDArray[np.int64] | None]:
-    """Return the reference's points (V, 3), triangles or None, and of a solid the vertices of its surface or None."""
+    """Return points (V, 3) of the reference, its triangles or None, and the surface vertices of a solid or None."""
     n = len(mean)
     representer = tree.attributes.get(f"{root}/representer", {})
     kind = str(representer.get("datasetType", "")).upper()
     if kind.startswith("IMAGE") or kind == "VECTOR":
-        raise ValueError(f"it is a model of {kind.lower()}s and not of surfaces")
+        raise ValueError(f"it is a model of {kind.lower()}s, not of surfaces")
     points, is_by_column = _points(tree, root, mean)
     reference = tree.arrays.get(f"{root}/representer/reference")
     if reference is not None and reference.dtype.itemsize == 1:
@@ -227,21 +227,21 @@ def _surface(
         is_by_column = cells.shape[0] == 3 if cells.shape[0] != cells.shape[1] else is_by_column
     cells = cells.T if is_by_column else cells
     if cells.min() < 0 or cells.max() >= n:
-        raise ValueError("its cells name points that it does not have")
+        raise ValueError("its cells refer to points that do not exist")
     if cells.shape[1] == 4:
         faces = _outer_triangles(cells.astype(np.int64), mean)
         used = np.unique(faces)
-        notes.append(f"Of its tetrahedra the surface is read, {len(faces)} triangles; {n - len(used)} points within "
-                     "are left out.")  # fmt: skip
+        notes.append(f"The surface of its tetrahedra is read, {len(faces)} triangles; {n - len(used)} interior points "
+                     "are omitted.")  # fmt: skip
         return points, np.searchsorted(used, faces).astype(np.int32), used
     if cells.shape[1] != 3:
-        notes.append(f"Its cells of {cells.shape[1]} points are left out.")
+        notes.append(f"Its cells of {cells.shape[1]} points are omitted.")
         return points, None, None
     return points, cells.astype(np.int32), None
 
 
 def _points(tree: Tree, root: str, mean: FloatArray) -> tuple[FloatArray, bool]:
-    """Return the points of the reference (V, 3), or the mean without one, and whether they are stored in columns."""
+    """Return the points (V, 3) of the reference, else of the mean, and whether they are stored in columns."""
     points = tree.arrays.get(f"{root}/{_LEGACY_POINTS}")
     if points is not None and points.shape == mean.shape:
         return points.astype(np.float64), False
@@ -273,7 +273,7 @@ def _mm(tree: Tree, root: str, attributes: Mapping[str, str]) -> float | None:
 
 
 def _parameters(tree: Tree, root: str) -> dict[str, str]:
-    """Return what our writer left for us."""
+    """Return the metadata that `write_statismo` stores."""
     start = f"{root}/{_PARAMETERS}/"
     return {path.removeprefix(start): text for path, text in tree.texts.items() if path.startswith(start)}
 
@@ -290,14 +290,14 @@ def _n_training(tree: Tree, root: str, part: _ModelBlock, parameters: Mapping[st
 def _landmarks(
     tree: Tree, surfaces: Sequence[FloatArray], faces: IntArray | None, notes: list[str], path: Path
 ) -> SurfaceLandmarks:
-    """Return the file's landmarks, which are points, on the surface that they are nearest.
+    """Return the landmarks of the file, which are points, on the surface to which they are nearest.
 
     Args:
-        tree: of the file.
-        surfaces: (V, 3) vertices of the reference and of the mean, in the file's unit.
-        faces: (F, 3) triangles of both.
-        notes: takes a sentence on landmarks that are left out.
-        path: of the file.
+        tree: content of the file.
+        surfaces: (V, 3) vertices of the reference and of the mean, in the unit of the file.
+        faces: (F, 3) triangles of both surfaces.
+        notes: list to which a sentence about omitted landmarks is added.
+        path: path of the file, used in messages.
     """
     landmark_points = _landmark_points(tree, path)
     if not landmark_points:
@@ -309,7 +309,7 @@ def _landmarks(
     if not is_on_surface.all():
         notes.append(
             f"{int((~is_on_surface).sum())} of {len(landmark_points)} landmarks lie more than "
-            f"{100 * _POINTS_AT:g} % of the extent of the model off its surface and are left out."
+            f"{100 * _POINTS_AT:g} % of the extent of the model off its surface and are omitted."
         )
     return best.select([name for name, is_there in zip(best.names, is_on_surface, strict=True) if is_there])
 
@@ -328,7 +328,7 @@ def _landmark_points(tree: Tree, path: Path) -> dict[str, FloatArray]:
 
 
 def _tlms(text: str) -> list[tuple[str, FloatArray]]:
-    """Return the landmarks of lines `name visible x y z`, those that are visible."""
+    """Return the visible landmarks of lines `name visible x y z`."""
     rows = [line.split() for line in text.splitlines() if line.strip() and not line.startswith("#")]
     return [(row[0], np.array(row[2:5], dtype=np.float64).reshape(3)) for row in rows if row[1] != "0"]
 
@@ -350,7 +350,7 @@ class _TreeBuilder:
         self.arrays[f"{root}/version/minorVersion"] = np.array(9, dtype=np.int32)
 
     def add_model(self, root: str, mean: FloatArray, displacements: FloatArray, representer: str) -> None:
-        """Add one model: `mean` (D,), and what one standard deviation of each mode does, `displacements` (D, K)."""
+        """Add a model: `mean` (D,), and `displacements` (D, K) of one standard deviation of each mode."""
         basis, stddev, _ = orthonormal(displacements)
         if not len(stddev):
             basis, stddev = np.full((len(mean), 1), len(mean) ** -0.5), np.zeros(1)
@@ -389,9 +389,9 @@ class _TreeBuilder:
 
 
 def tree_of(model: LinearModel) -> tuple[Tree, list[str]]:
-    """Return `model` as version 0.9 has it, in single precision, and sentences on what was changed or left out.
+    """Return the tree of `model` in version 0.9 and single precision, and sentences about changed or omitted data.
 
-    With expressions it is a Morphable Model of scalismo-faces, with a grey stand-in for the colour that it asks for.
+    With expressions it is a Morphable Model of scalismo-faces, with a grey placeholder for the required colour model.
     """
     provenance = {
         "provenance": model.provenance,
@@ -414,21 +414,21 @@ def tree_of(model: LinearModel) -> tuple[Tree, list[str]]:
         growing.texts["/color/representer/colorspace"] = "RGB"
         growing.add_version("")
         growing.add_catalogue("shape", "color", "expression")
-        notes.append("It is a Morphable Model of scalismo-faces, whose colour is a grey stand-in.")
+        notes.append("It is a Morphable Model of scalismo-faces; its colour model is a grey placeholder.")
     if model.landmarks:
-        # Placed on the surface in single precision, as in the file.
+        # Positions are on the surface in single precision, as in the file.
         positions = model.landmarks.positions(model.mean.astype(np.float32).astype(np.float64))
         growing.texts["/metadata/landmarks/json"] = LANDMARK_FORMATS[".json"].write(positions)
     kept_variance = sum(float((block.moved**2).sum()) for block in model.blocks)
     total = model.shape.total_variance
-    if total is not None and total > kept_variance * (1 + _LEFT_OUT):
-        notes.append(f"The {1 - kept_variance / total:.2g} of the variance that no mode holds is left out.")
+    if total is not None and total > kept_variance * (1 + _OMITTED):
+        notes.append(f"The {1 - kept_variance / total:.2g} of the variance that the modes do not contain is omitted.")
     return growing.tree(), notes
 
 
 def _hdf5_of(tree: Tree) -> bytes:
-    """Return `tree` as an HDF5 file; texts and attributes are single ones of fixed length, ended by a zero."""
-    import h5py  # a twentieth of a second that only those who write should wait
+    """Return `tree` as an HDF5 file; texts and attributes are null-terminated scalars of fixed length."""
+    import h5py  # slow import (0.05 s), needed for writing only
 
     low: Any = h5py
 

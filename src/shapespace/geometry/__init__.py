@@ -1,6 +1,6 @@
 """Geometry of triangle meshes: closest points, alignment, topology, remeshing; no models.
 
-Entry points: `closest`, `procrustes`, `doctor`, `distance`. Imported by every layer above, never by `io`.
+Entry points: `closest`, `procrustes`, `doctor`. Imported by every layer above, never by `io`.
 """
 
 from typing import TYPE_CHECKING

@@ -14,20 +14,20 @@ from shapespace.errors import InputError
 from shapespace.types import FloatArray
 
 _SINGULAR = 1e-7
-"""Share of the largest pivot below which a matrix is singular but for rounding."""
+"""Share of the largest pivot below which a matrix is singular up to rounding."""
 
 DEGREE = 3  # cubic: continuous curvature
 FEWEST, MOST = 4, 64
-"""Control points along each side: a cubic needs four, and beyond 64 the normal equations outgrow memory."""
+"""Limits of control points along each side: a cubic needs 4, and more than 64 need too much memory."""
 LEAST_SMOOTHNESS = 1e-9
-"""Decides where the data leave the spline open, and hardly moves it elsewhere."""
+"""Default weight of the energy: it determines the spline in gaps of the data, with little effect elsewhere."""
 
 
 def check_counts(counts: tuple[int, int]) -> None:
-    """Refuse numbers of control points that cannot be had.
+    """Check the numbers of control points.
 
     Raises:
-        InputError: not two numbers, or outside `FEWEST` to `MOST`.
+        InputError: the numbers are not two, or are outside `FEWEST` to `MOST`.
     """
     if len(counts) != 2 or not all(FEWEST <= count <= MOST for count in counts):
         raise InputError(
@@ -37,57 +37,57 @@ def check_counts(counts: tuple[int, int]) -> None:
 
 
 class SplineSquare:
-    """Splines with fixed control points and fixed places of the data on the square.
+    """Splines with fixed numbers of control points and fixed parameters of the data on the square.
 
     Args:
-        uv: (V, 2) in [0, 1].
-        counts: control points along u and along v, `FEWEST` to `MOST`.
-        smoothness: weight of the thin-plate energy (`thin_plate_energy`) beside the mean squared distance.
+        uv: (V, 2) parameters of the data, in [0, 1].
+        counts: numbers of control points along u and along v, `FEWEST` to `MOST`.
+        smoothness: weight of the thin-plate energy (`thin_plate_energy`) relative to the mean squared distance.
 
     Raises:
-        InputError: places off the square, or counts that cannot be.
+        InputError: parameters outside the square, or invalid counts.
     """
 
     def __init__(self, uv: FloatArray, counts: tuple[int, int], smoothness: float = LEAST_SMOOTHNESS) -> None:
         if uv.ndim != 2 or uv.shape[1] != 2 or not len(uv) or not ((uv >= 0) & (uv <= 1)).all():
-            raise InputError("A B-spline surface needs the place (u, v) of each vertex on the unit square, (V, 2).")
+            raise InputError("A B-spline surface needs parameters (V, 2) of the vertices on the unit square.")
         check_counts(counts)
         self.uv = uv
         self.counts = counts
         self.matrix: Any = _design_matrix(uv, counts)
         self._penalty = smoothness * len(uv) * thin_plate_energy(counts)
-        self._factor = self._factored(None)
+        self._factor = self._factorise(None)
 
     def values(self, control: FloatArray) -> FloatArray:
-        """Return the spline with coefficients `control` (mn, c) at the places, (V, c)."""
+        """Return the values (V, c) of the spline with coefficients `control` (mn, c) at the parameters of the data."""
         return np.asarray(self.matrix @ control)
 
     def fit(self, values: FloatArray, weights: FloatArray | None = None) -> FloatArray:
-        """Return the coefficients (mn, c) nearest to `values` (V, c), smooth where `weights` (V,) leaves them open.
+        """Return the coefficients (mn, c) that fit `values` (V, c) with `weights` (V,), smooth in gaps of the data.
 
         Raises:
-            InputError: fewer than three values with weight, or all on a line.
+            InputError: fewer than three values with positive weight, or all on a line.
         """
         from scipy.linalg import cho_solve
 
         if weights is None:
             return np.asarray(cast(Any, cho_solve)(self._factor, self.matrix.T @ values))
-        return np.asarray(cast(Any, cho_solve)(self._factored(weights), self.matrix.T @ (weights[:, None] * values)))
+        return np.asarray(cast(Any, cho_solve)(self._factorise(weights), self.matrix.T @ (weights[:, None] * values)))
 
-    def _factored(self, weights: FloatArray | None) -> Any:
+    def _factorise(self, weights: FloatArray | None) -> Any:
         from scipy.linalg import cho_factor
 
         B = self.matrix if weights is None else self.matrix.multiply(weights[:, None]).tocsr()
         normal = np.asarray((B.T @ self.matrix).todense()) + self._penalty
         try:
-            factored = cast(Any, cho_factor)(normal, lower=True)
-            pivots = np.diag(factored[0])
-            # What is singular but for rounding is factored by some versions of LAPACK, and by others not.
+            factors = cast(Any, cho_factor)(normal, lower=True)
+            pivots = np.diag(factors[0])
+            # Some versions of LAPACK factorise a matrix that is singular up to rounding, and others do not.
             if pivots.min() > _SINGULAR * pivots.max():
-                return factored
+                return factors
         except np.linalg.LinAlgError:
             pass
-        raise InputError("Too few vertices are there to fit a B-spline surface to them.")
+        raise InputError("There are too few vertices to fit a B-spline surface to them.")
 
 
 def _knots(count: int) -> FloatArray:
@@ -96,13 +96,13 @@ def _knots(count: int) -> FloatArray:
 
 
 def _design_matrix(uv: FloatArray, counts: tuple[int, int]) -> Any:
-    """Return the sparse (V, mn) values of each control point's weight at each place; rows sum to one."""
-    from scipy.interpolate import BSpline  # takes 0.2 s, which models of vertices need not wait for
+    """Return the sparse (V, mn) weights of each control point at each parameter; rows sum to one."""
+    from scipy.interpolate import BSpline  # slow import (0.2 s), not needed for models of vertices
     from scipy.sparse import csr_matrix
 
     along = [BSpline.design_matrix(uv[:, k], _knots(counts[k]), DEGREE).toarray() for k in range(2)]
     first, second = ((side != 0).argmax(axis=1) for side in along)
-    # A place at a knot has one weight of zero: the window of four is moved inside the row.
+    # A parameter at a knot has one weight of zero: the window of four is moved inside the row.
     width = np.arange(DEGREE + 1)
     i = np.minimum(first, counts[0] - DEGREE - 1)[:, None] + width
     j = np.minimum(second, counts[1] - DEGREE - 1)[:, None] + width

@@ -1,9 +1,10 @@
-"""Exact closest points on triangles by a tree of boxes in float64, compiled; other compiled loops may search it too.
+"""Exact closest points on triangles by a tree of boxes in float64, compiled; other compiled loops can search it too.
 
-The triangles are shared out by their centroids as in `kdtree`, with boxes around whole triangles. The closest point of
-one triangle is the foot on its plane if that lies inside, else on one of the edges it lies beyond (Ericson, Real-Time
-Collision Detection, 2005, section 5.1.5); a triangle without area is its three edges. Exact means up to the rounding of
-float64; of triangles that share the closest point, any may be named.
+The triangles are distributed by their centroids as in `kdtree`, with boxes around complete triangles. The closest point
+of a triangle is the foot of the query on its plane if it is inside the triangle, else a point on one of the edges that
+the foot is beyond (Ericson, Real-Time Collision Detection, 2005, section 5.1.5); a triangle without area is reduced to
+its edges. Results are exact up to the rounding of float64; if several triangles share the closest point, any may be
+returned.
 """
 
 from __future__ import annotations
@@ -25,19 +26,19 @@ from shapespace.geometry.kdtree import (
 )
 from shapespace.types import FloatArray, IntArray
 
-_LEAF_TRIANGLES = 4  # triangles in a leaf, at most: all of them are compared, instead of another level of boxes
+_LEAF_TRIANGLES = 4  # largest number of triangles in a leaf, all of which a search compares
 # Squared sine of the angle between two edges below which a triangle has no area.
 _FLAT = 1e-14
 
 
 class TriangleArrays(NamedTuple):
-    """What a tree consists of, as compiled loops take it.
+    """Arrays of a tree, as arguments of compiled loops.
 
     Args:
         corners: (F, 9) float64, coordinates of the three corners, in leaf order.
-        original: (F,) int32, the number each triangle had when it was given.
-        row_of: (F,) int32, the row of `corners` where each number is.
-        boxes: (2^(depth + 1) - 1, 6) float64, lowest and highest coordinates below each node.
+        original: (F,) int32, the index of each triangle in the input.
+        row_of: (F,) int32, the row of `corners` of each triangle of the input.
+        boxes: (2^(depth + 1) - 1, 6) float64, lowest and highest coordinates of the triangles below each node.
         depth: number of splits from the root to a leaf.
     """
 
@@ -49,11 +50,11 @@ class TriangleArrays(NamedTuple):
 
 
 class TriangleTree:
-    """Triangles to be searched.
+    """A search tree of triangles.
 
     Args:
-        vertices: (V, 3) float64, finite where triangles use them.
-        faces: (F, 3) int32, at least one; triangles may have no area, or repeat.
+        vertices: (V, 3) float64 positions; those that triangles use must be finite.
+        faces: (F, 3) int32 triangles, at least one; triangles may have no area, or be repeated.
 
     Raises:
         InputError: no triangles, arrays of another shape, or corners that are not finite.
@@ -78,7 +79,7 @@ class TriangleTree:
         row_of, corners = np.empty_like(original), np.empty((len(faces), 9))
         _cover(vertices, faces, original, row_of, corners, boxes, depth)
         self.arrays = TriangleArrays(corners, original, row_of, boxes, depth)
-        """The tree as compiled loops take it."""
+        """Arrays of the tree, as arguments of compiled loops."""
 
     def closest(
         self, queries: FloatArray, guess: IntArray | None = None
@@ -86,12 +87,12 @@ class TriangleTree:
         """Return triangle (M,) int32, barycentric (M, 3), points (M, 3) and squared distance (M,) of closest points.
 
         Args:
-            queries: (M, 3) float64, finite.
-            guess: (M,) int32 triangles that may be near, such as the last answers, -1 for none; they save time and
-                do not change the distance.
+            queries: (M, 3) float64 query points, finite.
+            guess: (M,) int32 indices of triangles that may be near, such as the previous results, -1 for none; they
+                save time and do not change the distance.
 
         Raises:
-            InputError: shapes that do not match, or a guess that is no triangle.
+            InputError: shapes that do not match, or a guess that is not the index of a triangle.
         """
         queries = writable(queries)
         guess = checked_guess(guess, len(queries), len(self.arrays.original))
@@ -118,7 +119,7 @@ def _cover(
     boxes: FloatArray,
     depth: int,
 ) -> None:
-    """Fill `place`, `corners` and `boxes` of triangles in the order `original`, leaves first."""
+    """Fill `row_of`, `corners` and `boxes` of triangles in the order `original`, leaves first."""
     count, first_leaf = len(original), (1 << depth) - 1
     for leaf in range(1 << depth):
         box = boxes[first_leaf + leaf]
@@ -138,7 +139,7 @@ def _cover(
 def _on_edge(
     ax: float, ay: float, az: float, bx: float, by: float, bz: float, ex: float, ey: float, ez: float
 ) -> tuple[float, float]:
-    """Return where on the edge from a to b = a + e the origin is closest, 0 to 1, and its squared distance."""
+    """Return the position, 0 to 1, of the point of edge a to a + e nearest to the origin, and its squared distance."""
     along, length = -(ax * ex + ay * ey + az * ez), ex * ex + ey * ey + ez * ez
     if along <= 0.0 or length == 0.0:
         return 0.0, ax * ax + ay * ay + az * az
@@ -155,9 +156,9 @@ def on_triangle(
 ) -> tuple[float, float, float]:
     """Return the squared distance of (x, y, z) to triangle `row`, and the weights of its second and third corner.
 
-    The distance is infinite where it is known to exceed `limit` (squared) from the triangle's plane alone.
+    The distance is infinite if the distance from the plane of the triangle already exceeds `limit` (squared).
     """
-    # Seen from the query, so that nothing is lost far from the origin.
+    # Relative to the query, to preserve precision far from the origin.
     ax, ay, az = corners[row, 0] - x, corners[row, 1] - y, corners[row, 2] - z
     bx, by, bz = corners[row, 3] - x, corners[row, 4] - y, corners[row, 5] - z
     cx, cy, cz = corners[row, 6] - x, corners[row, 7] - y, corners[row, 8] - z
@@ -179,9 +180,9 @@ def edges_of(vertices: FloatArray, faces: IntArray, f: int) -> tuple[float, floa
 def on_face(
     vertices: FloatArray, faces: IntArray, f: int, x: float, y: float, z: float, limit: float
 ) -> tuple[float, float, float]:
-    """Return what `on_triangle` does, of triangle `f` of `faces` (F, 3) on `vertices` (V, 3).
+    """Return the result of `on_triangle` for triangle `f` of `faces` (F, 3) on `vertices` (V, 3).
 
-    These take a sixth of the memory of the corners of all triangles, which counts where surfaces move.
+    Vertices take a sixth of the memory of the corners of all triangles, which saves time for moving surfaces.
     """
     i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
     ax, ay, az = vertices[i, 0] - x, vertices[i, 1] - y, vertices[i, 2] - z
@@ -196,7 +197,7 @@ def _nearest_on(
     ax: float, ay: float, az: float, bx: float, by: float, bz: float, cx: float, cy: float, cz: float,
     ux: float, uy: float, uz: float, vx: float, vy: float, vz: float, limit: float,
 ) -> tuple[float, float, float]:  # fmt: skip
-    """Return what `on_triangle` does for the origin, of corners a, b, c with u = b - a and v = c - a."""
+    """Return the result of `on_triangle` for the origin and corners a, b, c, with u = b - a and v = c - a."""
     nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
     area = nx * nx + ny * ny + nz * nz
     above = ax * nx + ay * ny + az * nz
@@ -232,7 +233,7 @@ def _nearest_on(
 def over_face(vertices: FloatArray, faces: IntArray, f: int, x: float, y: float, z: float) -> tuple[float, float]:
     """Return the weights of the second and third corner at the foot of (x, y, z) on the plane of triangle `f`.
 
-    The foot lies in the triangle where both are above 0 and their sum is below 1; of one without area they are not.
+    The foot is inside the triangle if both weights are above 0 and their sum is below 1; this is false without area.
     """
     i = faces[f, 0]
     ax, ay, az = x - vertices[i, 0], y - vertices[i, 1], z - vertices[i, 2]
@@ -252,12 +253,12 @@ def closest_one(
     """Return the triangle closest to (x, y, z), the squared distance, and the weights of its second and third corner.
 
     Args:
-        tree: the triangles.
-        x: coordinates of the query,
-        y: in the unit
-        z: of the triangles.
-        guess: a triangle that may be near, or -1.
-        stack: (STACK_SIZE,) float64 workspace, one a thread.
+        tree: arrays of the tree of triangles.
+        x: x coordinate of the query, in the unit of the triangles.
+        y: y coordinate of the query.
+        z: z coordinate of the query.
+        guess: index of a triangle that may be near, or -1.
+        stack: (STACK_SIZE,) float64 workspace, one per thread.
     """
     corners, boxes, depth = tree.corners, tree.boxes, tree.depth
     count, first_leaf = len(corners), (1 << depth) - 1
@@ -305,7 +306,7 @@ def closest_into(
     points_out: FloatArray,
     squared_out: FloatArray,
 ) -> None:
-    """Write the answers to `queries` (M, 3) given `guess` (M,): what `TriangleTree.closest` returns."""
+    """Write the results of `TriangleTree.closest` for `queries` (M, 3) with `guess` (M,) to the output arrays."""
     stack = np.empty(STACK_SIZE)
     for i in range(len(queries)):
         triangle, squared, b, c = closest_one(tree, queries[i, 0], queries[i, 1], queries[i, 2], guess[i], stack)

@@ -1,7 +1,7 @@
-"""Closest points on a surface or among its vertices, behind one contract.
+"""Closest points on a surface or among its vertices, with a common interface.
 
-An engine is built once a surface and then asked many times. `ENGINES` at the end is the one place where a new one
-is added; `tests/contracts/test_closest_contract.py` checks each against brute force.
+An engine is built once per surface and then queried many times. New engines are added to `ENGINES` at the end of this
+module; `tests/contracts/test_closest_contract.py` checks each against brute force.
 
 Distances between two surfaces are of both directions: a one-way average is zero for a model that has shrunk to a point
 of the scan (Sariyanidi et al., IJCB 2023).
@@ -21,20 +21,20 @@ from shapespace.reprs import short_repr
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, require
 
 if TYPE_CHECKING:
-    from shapespace.geometry.kdtree import Followed
+    from shapespace.geometry.kdtree import WarmStart
 
 
 @dataclass(frozen=True, eq=False)
 class ClosestPoints:
-    """The answers to M queries.
+    """Results of M queries.
 
     Args:
         points: (M, 3) closest points, in the frame of the surface.
-        distance: (M,) to them.
-        triangle: (M,) int32 triangle they lie in, or None when vertices were searched.
-        barycentric: (M, 3) weights of that triangle's corners; None when vertices were searched.
-        vertex: (M,) int32 nearest vertex, or when triangles were searched, the corner with the largest weight.
-        followed: what the engine needs to answer the next query from this one.
+        distance: (M,) distances of the queries from their closest points.
+        triangle: (M,) int32 triangle of each closest point, or None if vertices were searched.
+        barycentric: (M, 3) weights of the corners of that triangle; None if vertices were searched.
+        vertex: (M,) int32 nearest vertex, or if triangles were searched, the corner with the largest weight.
+        followed: data of the engine for a warm start of the next query.
     """
 
     points: FloatArray
@@ -42,7 +42,7 @@ class ClosestPoints:
     triangle: IntArray | None
     barycentric: FloatArray | None
     vertex: IntArray
-    followed: Followed | None = None
+    followed: WarmStart | None = None
 
     @property
     def rms(self) -> float:
@@ -51,26 +51,26 @@ class ClosestPoints:
 
 
 class ClosestPointEngine(Protocol):
-    """Built once a surface by `Engine(mesh)`; answers are float64 and exact."""
+    """Search structure, built once per surface by `Engine(mesh)`; results are float64 and exact."""
 
     def query(self, points: FloatArray, near: ClosestPoints | None = None) -> ClosestPoints:
         """Return the closest points of `points` (M, 3).
 
         Args:
-            points: (M, 3) in the frame of the surface, finite.
-            near: answers of this engine to M queries that were likely near these, such as those of the last
+            points: (M, 3) query points in the frame of the surface, finite.
+            near: results of this engine for M queries that were probably near these, such as those of the last
                 iteration; they save time and do not change the distances.
         """
         ...
 
 
-def _checked(points: FloatArray, near: ClosestPoints | None) -> FloatArray:
+def _check_queries(points: FloatArray, near: ClosestPoints | None) -> FloatArray:
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"Closest-point queries must have the shape (M, 3), not {points.shape}.")
     if not np.isfinite(points).all():
         raise InputError("Closest-point queries must be finite; the pose or shape that made them has diverged.")
     if near is not None and len(near.vertex) != len(points):
-        raise InputError(f"{len(near.vertex)} answers cannot be near to {len(points)} queries.")
+        raise InputError(f"{len(near.vertex)} previous results do not match {len(points)} queries.")
     return points
 
 
@@ -87,12 +87,12 @@ class VertexEngine:
 
     @property
     def order(self) -> IntArray:
-        """All vertices (V,), those that lie close to each other together."""
+        """Indices (V,) of all vertices, in an order that keeps neighbours close to each other."""
         return self._tree.arrays.original
 
     def query(self, points: FloatArray, near: ClosestPoints | None = None) -> ClosestPoints:
         """Return the nearest vertex of each of `points` (M, 3)."""
-        asked = _checked(points, near)
+        asked = _check_queries(points, near)
         if near is None:
             vertex, squared = self._tree.nearest(asked)
             return ClosestPoints(self._vertices[vertex], np.sqrt(squared), None, None, vertex)
@@ -113,24 +113,24 @@ class SurfaceEngine:
 
     def query(self, points: FloatArray, near: ClosestPoints | None = None) -> ClosestPoints:
         """Return the closest surface point of each of `points` (M, 3)."""
-        asked = _checked(points, near)
+        asked = _check_queries(points, near)
         triangle, barycentric, point, squared = self._tree.closest(asked, None if near is None else near.triangle)
         vertex = self._faces[triangle, barycentric.argmax(axis=1)]
         return ClosestPoints(point, np.sqrt(squared), triangle, barycentric, vertex)
 
 
 def on_boundary(matches: ClosestPoints, mesh: Mesh, boundary: BoolArray) -> BoolArray:
-    """Return (M,) True where a match lies on the rim of `mesh`.
+    """Return (M,) True for matches on the rim of `mesh`.
 
     Args:
         matches: closest points on `mesh`.
         mesh: the surface that was searched.
-        boundary: (V,) its rim vertices.
+        boundary: (V,) mask of the rim vertices of `mesh`.
     """
     if matches.triangle is None or matches.barycentric is None:
         return boundary[matches.vertex]
     corners = boundary[faces_of(mesh)[matches.triangle]]
-    # A point is on the rim when the corners that carry it all are.
+    # A point is on the rim if all corners with positive weight are rim vertices.
     inside = ~corners & (matches.barycentric > 1e-9)
     return np.asarray(~inside.any(axis=1))
 
@@ -139,19 +139,19 @@ ENGINES: Mapping[str, Callable[[Mesh], ClosestPointEngine]] = {
     "vertices": VertexEngine,
     "surface": SurfaceEngine,
 }
-"""Search engines by name; add one here and the contract test and `fit` find it."""
+"""Search engines by name; the contract test and `fit` find the engines here."""
 
 
 def finest_engine(mesh: Mesh) -> str:
-    """Return the name of the engine for the surface itself: its triangles where there are some, else its vertices."""
+    """Return the name of the engine for the triangles of a mesh, or for its vertices if there are no triangles."""
     return "vertices" if mesh.faces is None else "surface"
 
 
 def build_engine(mesh: Mesh, engine: str = "auto") -> ClosestPointEngine:
-    """Return the search structure of `mesh`: `auto` takes its `finest_engine`.
+    """Return the search structure of `mesh`; `auto` selects its `finest_engine`.
 
     Raises:
-        InputError: no engine of that name.
+        InputError: there is no engine of that name.
     """
     name = finest_engine(mesh) if engine == "auto" else engine
     if name not in ENGINES:
@@ -161,7 +161,7 @@ def build_engine(mesh: Mesh, engine: str = "auto") -> ClosestPointEngine:
 
 @dataclass(frozen=True)
 class DistanceSummary:
-    """Summary of the distances in one direction, mm; `count` points were measured, `fraction` of all."""
+    """Summary of the distances in one direction, mm, of `count` points, which are a `fraction` of all points."""
 
     mean: float
     median: float
@@ -173,7 +173,7 @@ class DistanceSummary:
 
     @staticmethod
     def of(distance_mm: FloatArray, counted: BoolArray | None = None) -> DistanceSummary:
-        """Summarise `distance_mm` (M,) over the points `counted` (M,); not-a-number where none are."""
+        """Summarise `distance_mm` (M,) over the points `counted` (M,); not-a-number if there are no such points."""
         used = distance_mm if counted is None else distance_mm[counted]
         nan = float("nan")
         if len(used) == 0:
@@ -194,14 +194,15 @@ class SurfaceDistances:
     """Closest distances between a model surface and a scan, both ways.
 
     Args:
-        model_to_scan_mm: (V,) from each model vertex to the scan.
-        scan_to_model_mm: (S,) from each scan vertex to the model.
-        scan_counted: (S,) False where the closest model point lies on the model's rim: there the scan shows
-            something that the model does not cover, such as the back of a head.
-        outside_of_model: (V,) True where the scan lies on the side to which the model's normal points; all True
-            where the model has no triangles.
-        scan_outside: (S,) the same of each scan vertex.
-        model_counted: (V,) False outside the region that they are held to; None where that is the whole model.
+        model_to_scan_mm: (V,) distance of each model vertex from the scan.
+        scan_to_model_mm: (S,) distance of each scan vertex from the model.
+        scan_counted: (S,) False if the closest model point is on the rim of the model: such scan vertices show parts
+            that the model does not cover, such as the back of a head.
+        outside_of_model: (V,) True if the scan is on the side to which the normal of the model points; all True if the
+            model has no triangles.
+        scan_outside: (S,) True if the scan vertex is on the side to which the normal of the model points.
+        model_counted: (V,) False outside the region to which the distances are restricted; None for the complete
+            model.
 
     Example:
         >>> distances = ss.surface_distances(meshes[0], meshes[1])
@@ -220,12 +221,12 @@ class SurfaceDistances:
 
     @property
     def model_to_scan_signed_mm(self) -> FloatArray:
-        """(V,) with a minus where the scan lies behind the model's surface."""
+        """(V,) signed distances, negative if the scan is behind the surface of the model."""
         return np.where(self.outside_of_model, self.model_to_scan_mm, -self.model_to_scan_mm)
 
     @property
     def scan_to_model_signed_mm(self) -> FloatArray:
-        """(S,) with a minus where the scan lies behind the model's surface; not-a-number where it is not counted."""
+        """(S,) signed distances, negative behind the surface of the model; NaN for vertices that do not count."""
         signed = np.where(self.scan_outside, self.scan_to_model_mm, -self.scan_to_model_mm)
         return np.where(self.scan_counted, signed, np.nan)
 
@@ -256,11 +257,12 @@ def surface_distances(
     """Measure closest distances between the vertices of each surface and the other surface.
 
     Args:
-        model: the model's surface, in the frame of the scan.
-        scan: the scan; point clouds are measured to their points.
-        scan_engine: the scan's search structure when it is there already.
-        mm_per_length: length of one unit of this frame, mm.
-        region: (V,) the model's vertices that count; the scan is then measured to what lies between them. None for all.
+        model: surface of the model, in the frame of the scan.
+        scan: surface or point cloud; distances from a point cloud are those from its points.
+        scan_engine: search structure of the scan, if it is already built.
+        mm_per_length: length of the unit of this frame, mm.
+        region: (V,) mask of the vertices of the model that count; the scan is compared with the part between these
+            vertices. None for all.
 
     Example:
         >>> bool(ss.surface_distances(meshes[0], meshes[1]).model_to_scan_mm.mean() > 0)
@@ -276,16 +278,16 @@ def surface_distances(
     outside, scan_outside = np.ones(len(model.vertices), dtype=bool), np.ones(len(scan.vertices), dtype=bool)
     if model.faces is not None:
         normals = vertex_normals(model)
-        outside = _in_front(forward.points - model.vertices, normals)
+        outside = _is_in_front(forward.points - model.vertices, normals)
         part_normals = normals if region is None else vertex_normals(part)
-        scan_outside = _in_front(scan.vertices - backward.points, _normals_at(backward, part, part_normals))
+        scan_outside = _is_in_front(scan.vertices - backward.points, _normals_at(backward, part, part_normals))
     return SurfaceDistances(
         forward.distance * mm_per_length, backward.distance * mm_per_length, counted, outside, scan_outside,
         region,
     )  # fmt: skip
 
 
-def _in_front(away: FloatArray, normals: FloatArray) -> BoolArray:
+def _is_in_front(away: FloatArray, normals: FloatArray) -> BoolArray:
     return np.asarray(np.einsum("ij,ij->i", away, normals) >= 0.0)
 
 

@@ -1,4 +1,4 @@
-"""The mesh doctor: what is in a scan, what is wrong with it, and the repairs that cannot do harm."""
+"""The mesh doctor: properties of a scan, its defects, and safe repairs."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from shapespace.types import BoolArray, ByteArray, FloatArray, IntArray, Mesh
 NON_FINITE = "coordinates that are NaN or infinite"
 """Text of findings on vertices without a position."""
 
-# Twice the area of a triangle over its longest edge squared; float64 cannot tell less from a line.
+# Twice the area of a triangle over its longest edge squared; smaller values are a line up to float64 rounding.
 _DEGENERATE = 1e-12
-# Smallest over largest spread below which points lie on a plane, and second over largest for a line.
+# Ratio of the smallest to the largest spread below which points are on a plane, and of the second for a line.
 _FLAT = 1e-6
 # Squares and cubes of coordinates must stay within float64.
 _ABSURD = 1e80
-# Distance from the origin, over the size, from which coordinates stored as float32 get coarse.
+# Distance from the origin, relative to the size, above which coordinates stored as float32 are coarse.
 _FAR = 100.0
-# How far the normals of an open surface must point to its inside before it is turned: a convex cap gives
-# +0.3 or more, and a surface that is as much bowl as cap gives 0.
+# Mean inward component of the normals of an open surface above which it is reversed: a convex cap has +0.3 or more,
+# and a surface with equal convex and concave parts has 0.
 _REVERSED = -0.05
 
 
@@ -35,12 +35,12 @@ FindingLevel: TypeAlias = Literal["fixed", "note", "refused"]
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing the doctor found.
+    """A finding of the mesh doctor.
 
     Args:
-        level: "fixed" (repaired), "note" (left as it is) or "refused" (cannot be fitted).
-        problem: a sentence on what is there.
-        action: a sentence on what fitting does about it, or for "refused", what the user can do.
+        level: severity, see `FindingLevel`: "fixed" (repaired), "note" (unchanged), or an error that prevents fitting.
+        problem: sentence about the problem.
+        action: sentence about the action of fitting, or for an error, about the action of the user.
     """
 
     level: FindingLevel
@@ -50,28 +50,28 @@ class Finding:
 
 @dataclass(frozen=True, eq=False)
 class MeshReport:
-    """What is in a mesh, as it is in its file.
+    """Properties of a mesh as in its file.
 
     Args:
-        name: the mesh's name.
+        name: name of the mesh.
         vertices: number of vertices.
         triangles: number of triangles; 0 for a point cloud.
-        bounds: (2, 3) float64 lowest and highest finite coordinates, in the mesh's unit; NaN if there are none.
-        extent: (3,) float64 size along the axes, in the mesh's unit.
+        bounds: (2, 3) float64 lowest and highest finite coordinates, in the unit of the mesh; NaN if there are none.
+        extent: (3,) float64 size along the axes, in the unit of the mesh.
         components: number of connected pieces of surface; 0 for a point cloud.
-        largest_component_share: the share of the area that the largest piece has, 0 to 1.
-        boundary_edges: edges with one triangle; 0 means the surface is closed.
-        non_manifold_edges: edges with more than two triangles.
-        duplicate_vertices: vertices that lie exactly on an earlier one.
-        unreferenced_vertices: vertices that no triangle uses; 0 for a point cloud.
-        degenerate_triangles: triangles without area.
-        duplicate_triangles: triangles on the same three points as an earlier one.
-        non_finite_vertices: vertices with a coordinate that is NaN or infinite.
-        inconsistent_edges: edges whose two triangles wind against each other.
-        reversed_triangles: triangles that the repair turns round.
-        planarity: smallest over largest singular value of the centred points: 0 on a plane.
-        origin_distance: distance of the centroid from the origin over the diagonal of the bounds.
-        findings: everything worth saying, in the order in which it was found.
+        largest_component_share: share of the area of the largest piece, 0 to 1.
+        boundary_edges: number of edges with one triangle; 0 for a closed surface.
+        non_manifold_edges: number of edges with more than two triangles.
+        duplicate_vertices: number of vertices with the position of an earlier vertex.
+        unreferenced_vertices: number of vertices that no triangle uses; 0 for a point cloud.
+        degenerate_triangles: number of triangles without area.
+        duplicate_triangles: number of triangles with the same corners as an earlier triangle.
+        non_finite_vertices: number of vertices with a coordinate that is NaN or infinite.
+        inconsistent_edges: number of edges whose two triangles have opposite winding.
+        reversed_triangles: number of triangles that the repair reverses.
+        planarity: ratio of the smallest to the largest singular value of the centred points; 0 on a plane.
+        origin_distance: distance of the centroid from the origin, relative to the diagonal of the bounds.
+        findings: all findings, in the order of the checks.
     """
 
     name: str
@@ -96,39 +96,39 @@ class MeshReport:
 
     @property
     def usable(self) -> bool:
-        """Whether fitting takes the mesh."""
+        """Whether fitting accepts the mesh."""
         return all(finding.level != "refused" for finding in self.findings)
 
 
 def examine(mesh: Mesh, *, strict: bool = False) -> MeshReport:
-    """Return what is in `mesh`, what is wrong with it and what fitting does about it; nothing is refused here.
+    """Return the properties of `mesh`, its defects and their treatment in fitting, without raising errors.
 
-    Edges, pieces and winding are those of the repaired mesh, since without merging equal vertices a soup of
-    triangles has as many pieces as triangles.
+    Edges, pieces and winding are those of the repaired mesh, since before merging equal vertices, each triangle of a
+    triangle soup is a separate piece.
 
     Args:
-        mesh: any mesh, also one without points or with NaN in it.
-        strict: whether triangles that use vertices with non-finite coordinates are a reason to refuse the mesh.
+        mesh: any mesh, including a mesh without points or with NaN coordinates.
+        strict: whether triangles that use vertices with non-finite coordinates are an error.
     """
     return _examine_and_repair(mesh, strict=strict).report
 
 
 def repair(mesh: Mesh, *, strict: bool = False) -> tuple[Mesh, tuple[Finding, ...]]:
-    """Fix what can be fixed safely and refuse what cannot be fitted.
+    """Repair defects that can be repaired safely, and raise an error for a mesh that cannot be fitted.
 
     Vertices with non-finite coordinates are removed, with the triangles that use them. Exactly equal vertices are
-    merged. Triangles without area, repeated triangles, and vertices that no triangle uses are dropped. Winding is made
-    consistent and turned outward. Several pieces, non-manifold edges and a far origin are kept and noted.
+    merged. Triangles without area, repeated triangles, and vertices that no triangle uses are removed. Winding is made
+    consistent and outward. Several pieces, non-manifold edges and a far origin are kept and noted.
 
     Args:
-        mesh: a scan as read. The numbering of its vertices does not survive; its landmarks and name do.
-        strict: refuse a mesh with triangles that use vertices with non-finite coordinates, instead of removing them.
+        mesh: a scan as read. Its landmarks and name are preserved; the numbering of its vertices is not.
+        strict: whether triangles that use vertices with non-finite coordinates are an error, instead of being removed.
 
     Returns:
-        The repaired mesh (`mesh` itself where there was nothing to do), and the findings.
+        The repaired mesh (`mesh` itself if no repair was needed), and the findings.
 
     Raises:
-        MeshError: it cannot be fitted; the one sentence names it and says what to do.
+        MeshError: the mesh cannot be fitted; the message names the mesh, the problem and the action of the user.
     """
     state = _examine_and_repair(mesh, strict=strict)
     for finding in state.report.findings:
@@ -138,7 +138,7 @@ def repair(mesh: Mesh, *, strict: bool = False) -> tuple[Mesh, tuple[Finding, ..
 
 
 def examine_and_repair(mesh: Mesh, *, strict: bool = False) -> tuple[MeshReport, Mesh | None]:
-    """Return the report of `examine`, and the mesh of `repair`, None where that refuses it, computed once."""
+    """Return the report of `examine` and the mesh of `repair`, or None if the mesh cannot be fitted."""
     state = _examine_and_repair(mesh, strict=strict)
     is_refused = any(finding.level == "refused" for finding in state.report.findings)
     return state.report, None if is_refused else state.repaired(mesh)
@@ -146,14 +146,14 @@ def examine_and_repair(mesh: Mesh, *, strict: bool = False) -> tuple[MeshReport,
 
 @dataclass(frozen=True, eq=False)
 class _RepairState:
-    """A mesh between two repairs, and the report so far; each step returns a new state.
+    """A partly repaired mesh and its report; each step returns a new state.
 
     Args:
-        vertices: (V, 3).
-        faces: (F, 3), or None for a point cloud.
-        faces_in_file: (F, 3) the same triangles in the vertex numbers of the file.
-        colours: of the vertices, or None.
-        report: counts and findings so far.
+        vertices: (V, 3) positions.
+        faces: (F, 3) triangles, or None for a point cloud.
+        faces_in_file: (F, 3) the same triangles with the vertex numbers of the file.
+        colours: (V, 3) colours of the vertices, or None.
+        report: counts and findings of the steps so far.
     """
 
     vertices: FloatArray
@@ -163,13 +163,13 @@ class _RepairState:
     report: MeshReport
 
     def repaired(self, mesh: Mesh) -> Mesh:
-        """Return the mesh after the repairs: `mesh` itself if there were none."""
+        """Return the repaired mesh, or `mesh` itself if nothing was repaired."""
         if all(finding.level != "fixed" for finding in self.report.findings):
             return mesh
         return Mesh(self.vertices, self.faces, mesh.landmarks, mesh.name, self.colours, mesh.notes)
 
     def measured(self, **values: Any) -> _RepairState:
-        """Return the state with these fields of the report."""
+        """Return the state with these values in the report."""
         return replace(self, report=replace(self.report, **values))
 
     def reported(self, level: FindingLevel, problem: str, action: str) -> _RepairState:
@@ -185,23 +185,23 @@ class _RepairState:
         what: str,
         action: str,
     ) -> _RepairState:
-        """Return the state `without` that many things, with a measure and a finding; itself where there are none.
+        """Return the state without defective elements, with their count and a finding; itself if the count is 0.
 
         Args:
-            without: returns the state without them.
-            measure: field of the report that counts them.
-            count: of the things.
-            names: one and many of them, with their verb.
-            what: end of the sentence on them.
-            action: what was done.
+            without: function that returns the state without these elements.
+            measure: name of the field of the report for their count.
+            count: number of defective elements.
+            names: singular and plural of the elements, each with the verb.
+            what: end of the sentence about the problem.
+            action: sentence about the repair.
         """
         if not count:
             return self
-        problem = f"{_some(count, *names)} {what}"
+        problem = f"{_format_count(count, *names)} {what}"
         return without().measured(**{measure: count}).reported("fixed", problem, action)
 
     def with_vertices_where(self, keep: BoolArray) -> _RepairState:
-        """Return the state with some of the vertices, and the triangles between them."""
+        """Return the state with the vertices `keep` (V,) and the triangles between them."""
         colours = None if self.colours is None else self.colours[keep]
         if self.faces is None:
             return replace(self, vertices=self.vertices[keep], colours=colours)
@@ -209,12 +209,12 @@ class _RepairState:
         return replace(self, vertices=vertices, faces=faces, colours=colours)
 
     def with_triangles_where(self, keep: BoolArray | IntArray) -> _RepairState:
-        """Return the state with some of the triangles."""
+        """Return the state with the triangles `keep`, a mask (F,) or indices."""
         assert self.faces is not None and self.faces_in_file is not None
         return replace(self, faces=self.faces[keep], faces_in_file=self.faces_in_file[keep])
 
     def with_triangles_reversed(self, reverse: BoolArray) -> _RepairState:
-        """Return the state with the winding of some of the triangles (F,) reversed."""
+        """Return the state with the winding of the triangles `reverse` (F,) reversed."""
         assert self.faces is not None
         faces = np.where(reverse[:, None], self.faces[:, ::-1], self.faces)
         count = self.report.reversed_triangles + int(reverse.sum())
@@ -222,12 +222,12 @@ class _RepairState:
 
 
 def _examine_and_repair(mesh: Mesh, *, strict: bool) -> _RepairState:
-    finite = _finite(mesh.vertices)
-    state = _drop_non_finite(_initial(mesh, finite), finite, strict=strict)
+    finite = _finite_vertices(mesh.vertices)
+    state = _drop_non_finite_vertices(_initial_state(mesh, finite), finite, strict=strict)
     if not state.report.usable:
         return state
     if not len(state.vertices):
-        problem = "There are no points with finite coordinates in it."
+        problem = "It has no points with finite coordinates."
         return state.reported("refused", problem, "correct its coordinates, or export the scan again.")
     if np.abs(state.vertices).max() > _ABSURD:
         return state.reported("refused", "Its coordinates are too large to be lengths.", "export the scan again.")
@@ -238,8 +238,8 @@ def _examine_and_repair(mesh: Mesh, *, strict: bool) -> _RepairState:
     return _inspect_surface(state) if state.faces is not None and len(state.faces) else state
 
 
-def _initial(mesh: Mesh, finite: BoolArray) -> _RepairState:
-    """Return the state of `mesh` as it is in its file; `finite` (V,) are the vertices with a position."""
+def _initial_state(mesh: Mesh, finite: BoolArray) -> _RepairState:
+    """Return the state of `mesh` as in its file; `finite` (V,) is the mask of vertices with finite coordinates."""
     faces = None if mesh.faces is None else np.array(mesh.faces)
     points = mesh.vertices[finite]
     bounds = _bounds(points) if len(points) else np.full((2, 3), np.nan)
@@ -267,27 +267,27 @@ def _initial(mesh: Mesh, finite: BoolArray) -> _RepairState:
     return _RepairState(mesh.vertices, faces, faces, mesh.colours, report)
 
 
-def _drop_non_finite(state: _RepairState, finite: BoolArray, *, strict: bool) -> _RepairState:
-    """Remove vertices that are not finite, and triangles that use them; refuse these triangles if `strict`."""
+def _drop_non_finite_vertices(state: _RepairState, finite: BoolArray, *, strict: bool) -> _RepairState:
+    """Remove vertices that are not finite and triangles that use them; such triangles are an error if `strict`."""
     count = state.report.non_finite_vertices
     if not count:
         return state
-    problem = f"It has {_some(count, 'vertex', 'vertices')} with {NON_FINITE}"
+    problem = f"It has {_format_count(count, 'vertex', 'vertices')} with {NON_FINITE}"
     finite_faces = None if state.faces is None else np.asarray(finite[state.faces].all(axis=1))
     lost = 0 if finite_faces is None else int((~finite_faces).sum())
     if finite_faces is None or not lost:
-        action = "They are missing points that no triangle uses, and are dropped."
+        action = "They are missing points that no triangle uses, and are removed."
         return state.with_vertices_where(finite).reported("fixed", f"{problem}.", action)
-    problem += f", used by {_some(lost, 'triangle', 'triangles')}."
+    problem += f", used by {_format_count(lost, 'triangle', 'triangles')}."
     if strict:
-        action = "export the scan again without them, or leave out --strict to remove them."
+        action = "export the scan again without them, or omit --strict to remove them."
         return state.reported("refused", problem, action)
     state = state.with_triangles_where(finite_faces).with_vertices_where(finite)
     return state.reported("fixed", problem, "They are removed together, which leaves a hole.")
 
 
 def _merge_vertices(state: _RepairState) -> _RepairState:
-    first, index = _equal_rows((state.vertices + 0.0).view(np.int64))  # 0 and -0 have other bits
+    first, index = _equal_rows((state.vertices + 0.0).view(np.int64))  # 0 and -0 have different bits
 
     def merged() -> _RepairState:
         faces = None if state.faces is None else index[state.faces]
@@ -307,7 +307,7 @@ def _drop_degenerate(state: _RepairState) -> _RepairState:
     flat = topology.flat_triangles(np.array(state.vertices), state.faces, _DEGENERATE)
     others, count = partial(state.with_triangles_where, ~flat), int(flat.sum())
     return state.fixed(
-        others, "degenerate_triangles", count, ("triangle has", "triangles have"), "no area.", "They are dropped."
+        others, "degenerate_triangles", count, ("triangle has", "triangles have"), "no area.", "They are removed."
     )
 
 
@@ -328,15 +328,15 @@ def _drop_unreferenced(state: _RepairState) -> _RepairState:
     used = np.zeros(len(state.vertices), dtype=np.bool_)
     used[state.faces] = True
     others, count = partial(state.with_vertices_where, used), int((~used).sum())
-    names, action = ("vertex belongs", "vertices belong"), "They are not part of the surface, and are dropped."
+    names, action = ("vertex belongs", "vertices belong"), "They are not part of the surface, and are removed."
     return state.fixed(others, "unreferenced_vertices", count, names, "to no triangle.", action)
 
 
 def _check_spread(state: _RepairState) -> _RepairState:
-    """Refuse a mesh whose points span no space; note one that is far from the origin, and a point cloud."""
+    """Report an error if the points do not span the space, and a note if they are far from the origin or a cloud."""
     vertices = state.vertices
     centre = vertices.mean(axis=0)
-    # The eigenvalues of the 3 x 3 covariance would lose half of the digits; R of QR keeps them.
+    # The eigenvalues of the 3 x 3 covariance would lose half of the digits; R of QR preserves them.
     spread = np.linalg.svd(np.linalg.qr(vertices - centre, mode="r"), compute_uv=False)
     spread = np.concatenate([spread, np.zeros(3 - len(spread))])
     largest = float(spread[0])
@@ -350,16 +350,16 @@ def _check_spread(state: _RepairState) -> _RepairState:
     rounding = _float32_rounding(vertices)
     tolerance = _FLAT
     if rounding is not None and largest > 0:
-        # Rounding to float32 lifts a plane off itself by up to this much.
+        # Rounding to float32 displaces points of a plane by up to this distance.
         tolerance = max(tolerance, rounding * float(np.sqrt(len(vertices))) / largest)
-    if (refusal := _refusal(state, spread, tolerance)) is not None:
+    if (refusal := _find_degeneracy(state, spread, tolerance)) is not None:
         state = state.reported("refused", *refusal)
     if diagonal > 0 and origin_distance > _FAR:
         grid = "" if rounding is None else f", on a grid of about {rounding:.2g}"
         state = state.reported(
             "note",
             f"It lies {distance:.3g} units from the origin, {origin_distance:.0f} times its own size{grid}.",
-            "It is moved to its centroid in double precision before fitting, and back after.",
+            "It is moved to its centroid in double precision before fitting, and back afterwards.",
         )
     if state.faces is None:
         state = state.reported("note", "It has no triangles: a point cloud.", "Distances are measured to its points.")
@@ -367,7 +367,7 @@ def _check_spread(state: _RepairState) -> _RepairState:
 
 
 def _float32_rounding(vertices: FloatArray) -> float | None:
-    """Return the rounding error of coordinates that are stored as float32, in their unit; None for others."""
+    """Return the rounding error of coordinates that are stored as float32, in their unit; None if they are not."""
     largest = np.abs(vertices).max()
     in_range = bool((np.abs(vertices) <= np.finfo(np.float32).max).all())
     if not in_range or not np.array_equal(vertices.astype(np.float32), vertices):
@@ -375,15 +375,15 @@ def _float32_rounding(vertices: FloatArray) -> float | None:
     return float(largest) * float(np.finfo(np.float32).eps)
 
 
-def _refusal(state: _RepairState, spread: FloatArray, tolerance: float) -> tuple[str, str] | None:
-    """Return what is wrong with points of these singular values (3,) and what to do about it; None if nothing is."""
+def _find_degeneracy(state: _RepairState, spread: FloatArray, tolerance: float) -> tuple[str, str] | None:
+    """Return the problem of points with these singular values (3,) and the action of the user, or None."""
     if len(state.vertices) == 1:
         return "All its points are equal.", "give a scan of a surface."
     if spread[1] <= tolerance * float(spread[0]):
         return "All its points lie on a line.", "give a scan of a surface."
     if state.faces is not None and len(state.faces) <= 1:
         count = "only one triangle" if len(state.faces) else "no triangle that has an area"
-        return f"It has {count}.", "give a scan of a whole surface."
+        return f"It has {count}.", "give a scan of a complete surface."
     if len(state.vertices) < 4:
         return f"It has only {len(state.vertices)} different points.", "give at least 4, not on a plane."
     if spread[2] <= tolerance * float(spread[0]):
@@ -405,8 +405,8 @@ def _inspect_surface(state: _RepairState) -> _RepairState:
     if edges.non_manifold:
         state = state.reported(
             "note",
-            f"{_some(edges.non_manifold, 'edge has', 'edges have')} more than two triangles.",
-            "They are kept; winding is not carried across them.",
+            f"{_format_count(edges.non_manifold, 'edge has', 'edges have')} more than two triangles.",
+            "They are kept; winding is not made consistent across them.",
         )
     if state.report.inconsistent_edges:
         state, edges = _cut_glued_edges(state, edges)
@@ -427,9 +427,9 @@ def _inspect_surface(state: _RepairState) -> _RepairState:
 
 
 def _cut_glued_edges(state: _RepairState, edges: _Edges) -> tuple[_RepairState, _Edges]:
-    """Separate pieces that wind against each other where only the merging of vertices has joined them.
+    """Separate pieces of opposite winding that are joined only because their vertices were merged.
 
-    In a soup of triangles merging has joined every edge, and winding is all there is.
+    In a triangle soup, merging joins every edge, and winding is the only information.
     """
     assert state.faces_in_file is not None
     first, second = state.faces_in_file[edges.pairs].swapaxes(0, 1)
@@ -437,16 +437,18 @@ def _cut_glued_edges(state: _RepairState, edges: _Edges) -> tuple[_RepairState, 
     seam = glued & edges.same_way
     if glued.mean() >= 0.5 or not seam.any():
         return state, edges
-    problem = f"At {_some(int(seam.sum()), 'edge', 'edges')}, pieces that wind against each other touch."
-    return state.reported("note", problem, "They are kept; winding is not carried across."), edges.without(seam)
+    problem = f"At {_format_count(int(seam.sum()), 'edge', 'edges')}, pieces with opposite winding touch."
+    return state.reported("note", problem, "They are kept; winding is not made consistent across them."), edges.without(
+        seam
+    )
 
 
 def _make_winding_consistent(state: _RepairState, edges: _Edges) -> _RepairState:
-    """Make winding consistent in each patch, turning the smaller side."""
+    """Make winding consistent in each patch by reversing the smaller set of triangles."""
     assert state.faces is not None
     n = len(state.faces)
-    # Each triangle is there twice, as it is (i) and turned (i + n); an edge ties the states that agree.
-    # A patch that can be oriented falls into two mirrored halves; a Moebius strip stays in one.
+    # Each triangle has two nodes, unchanged (i) and reversed (i + n); an edge links nodes of consistent winding.
+    # An orientable patch consists of two separate components; a Moebius strip of a single component.
     a, b = edges.pairs.T
     shift = np.where(edges.same_way, n, 0)
     _, label = _components(2 * n, np.stack([a, b + shift], axis=1), np.stack([a + n, b + n - shift], axis=1))
@@ -456,43 +458,45 @@ def _make_winding_consistent(state: _RepairState, edges: _Edges) -> _RepairState
     one_sided = int((as_is == turned).sum())
     flip = smaller & (as_is != turned)
     if flip.any():
-        problem = f"{_some(int(flip.sum()), 'triangle winds', 'triangles wind')} against the neighbours."
-        state = state.with_triangles_reversed(flip).reported("fixed", problem, "They are turned round.")
+        problem = (
+            f"{_format_count(int(flip.sum()), 'triangle has', 'triangles have')} a winding opposite to the neighbours."
+        )
+        state = state.with_triangles_reversed(flip).reported("fixed", problem, "Their winding is reversed.")
     if one_sided:
         state = state.reported(
             "note",
-            f"{_some(one_sided, 'triangle is', 'triangles are')} on a one-sided surface (a Moebius strip).",
-            "They are kept as they are; their normals cannot be trusted.",
+            f"{_format_count(one_sided, 'triangle is', 'triangles are')} on a one-sided surface (a Moebius strip).",
+            "They are unchanged; their normals are not reliable.",
         )
     return state
 
 
 def _turn_outward(state: _RepairState, edges: _Edges, middles: FloatArray, normals: FloatArray) -> _RepairState:
-    """Turn closed patches with negative volume, and the open surface if its normals point inward.
+    """Reverse closed patches with negative volume, and the open surface if its normals point inward.
 
     Args:
-        state: with consistent winding in each patch.
-        edges: of its triangles.
-        middles: (F, 3) of the triangles, from the centroid of the vertices.
-        normals: (F, 3), as long as the triangles are large.
+        state: mesh with consistent winding in each patch.
+        edges: edges of the triangles of `state`.
+        middles: (F, 3) centroids of the triangles, relative to the centroid of the vertices.
+        normals: (F, 3) normals of the triangles, with the area as length.
     """
     count, patch = edges.patches()
     closed = np.ones(count, dtype=np.bool_)
     closed[patch[edges.loose]] = False
-    if closed.any() and (inside_out := _inside_out(closed, patch, middles, normals)).any():
-        problem = f"{_some(int(inside_out.sum()), 'closed piece is', 'closed pieces are')} inside out."
+    if closed.any() and (inside_out := _find_inside_out(closed, patch, middles, normals)).any():
+        problem = f"{_format_count(int(inside_out.sum()), 'closed piece is', 'closed pieces are')} inside out."
         action = "Its winding is reversed." if inside_out.sum() == 1 else "Their winding is reversed."
         state = state.with_triangles_reversed(inside_out[patch]).reported("fixed", problem, action)
-    # Patches of one scan come from one scanner, so the open ones are judged and turned together.
+    # Patches of a scan come from one scanner, so open patches are tested and reversed together.
     is_open = ~closed[patch]
     if is_open.any() and _points_inward(is_open, middles, normals):
-        problem = "The normals of the open surface point to its inside, so its winding looks reversed."
+        problem = "The normals of the open surface point inward, so its winding is probably reversed."
         state = state.with_triangles_reversed(is_open).reported("fixed", problem, "Its winding is reversed.")
     return state
 
 
-def _inside_out(closed: BoolArray, patch: IntArray, middles: FloatArray, normals: FloatArray) -> BoolArray:
-    """Return (P,) which of the `closed` patches (P,) have a negative volume and are not the wall of a cavity."""
+def _find_inside_out(closed: BoolArray, patch: IntArray, middles: FloatArray, normals: FloatArray) -> BoolArray:
+    """Return the mask (P,) of `closed` patches (P,) that have a negative volume and are not the wall of a cavity."""
     from shapespace.geometry import topology  # compiled
 
     count, areas = len(closed), _lengths(normals)
@@ -504,13 +508,13 @@ def _inside_out(closed: BoolArray, patch: IntArray, middles: FloatArray, normals
     volume = np.bincount(patch, weights=outward, minlength=count) / 3
     biggest = int(np.argmax(np.where(closed, np.abs(volume), -1.0)))
     low, high = topology.boxes_of(middles, patch, count)
-    # The wall of a cavity rightly looks inward.
+    # The normals of the wall of a cavity correctly point inward.
     cavity = (low > low[biggest]).all(axis=1) & (high < high[biggest]).all(axis=1)
     return np.asarray(closed & (volume < 0) & ~cavity)
 
 
 def _points_inward(is_open: BoolArray, middles: FloatArray, normals: FloatArray) -> bool:
-    """Return whether the normals of the triangles `is_open` (F,) point to the inside of their surface."""
+    """Return whether the normals of the triangles `is_open` (F,) point inward."""
     weight = np.where(is_open, _lengths(normals), 0.0)
     arm = middles - weight @ middles / weight.sum()
     reach = float(weight @ _lengths(arm))
@@ -523,10 +527,10 @@ class _Edges:
     """The edges of F triangles.
 
     Args:
-        n_faces: F.
-        pairs: (E, 2) the triangles that meet across each manifold edge.
-        same_way: (E,) whether they run along it in the same direction, so that one of them is turned.
-        loose: the triangles at all other edges.
+        n_faces: number of triangles, F.
+        pairs: (E, 2) triangles at each manifold edge.
+        same_way: (E,) whether both triangles pass the edge in the same direction, so that one is reversed.
+        loose: (L,) triangles at all other edges.
         boundary: number of edges with one triangle.
         non_manifold: number of edges with more than two triangles.
     """
@@ -546,17 +550,17 @@ class _Edges:
         return _Edges(len(faces), pairs, same_way, loose, boundary, non_manifold)
 
     def without(self, seam: BoolArray) -> _Edges:
-        """Return the edges with the pairs where `seam` (E,) not joined."""
+        """Return the edges without the pairs `seam` (E,)."""
         loose = np.concatenate([self.loose, self.pairs[seam].ravel()])
         return replace(self, pairs=self.pairs[~seam], same_way=self.same_way[~seam], loose=loose)
 
     def patches(self) -> tuple[int, IntArray]:
-        """Return the number of patches joined by manifold edges, and (F,) the patch of each triangle."""
+        """Return the number of patches, connected by manifold edges, and the patch (F,) of each triangle."""
         return _components(self.n_faces, self.pairs)
 
 
 def _components(nodes: int, *links: IntArray) -> tuple[int, IntArray]:
-    """Return the number of connected components and (nodes,) the component of each; `links` are (E, 2)."""
+    """Return the number of connected components and the component (nodes,) of each node; `links` are (E, 2)."""
     from shapespace.geometry import topology  # compiled
 
     parent = np.arange(nodes, dtype=np.int32)
@@ -566,7 +570,7 @@ def _components(nodes: int, *links: IntArray) -> tuple[int, IntArray]:
 
 
 def _equal_rows(rows: npt.NDArray[np.int64] | IntArray) -> tuple[IntArray, IntArray]:
-    """Return where each different row of `rows` (N, 3) first appears, in that order, and (N,) which one each is."""
+    """Return the first index of each distinct row of `rows` (N, 3), in order, and the distinct row (N,) of each row."""
     from shapespace.geometry import topology  # compiled
 
     first = topology.first_of_equal(rows)
@@ -574,8 +578,8 @@ def _equal_rows(rows: npt.NDArray[np.int64] | IntArray) -> tuple[IntArray, IntAr
     return np.flatnonzero(is_first).astype(np.int32), (np.cumsum(is_first, dtype=np.int32) - 1)[first]
 
 
-def _finite(vertices: FloatArray) -> BoolArray:
-    """Return (V,) whether all coordinates are finite; one pass where they are, as nearly always."""
+def _finite_vertices(vertices: FloatArray) -> BoolArray:
+    """Return the mask (V,) of vertices with finite coordinates; the usual case, in which all are, takes one pass."""
     if np.isfinite(vertices).all():
         return np.ones(len(vertices), dtype=np.bool_)
     return np.asarray(np.isfinite(vertices).all(axis=1))
@@ -583,7 +587,7 @@ def _finite(vertices: FloatArray) -> BoolArray:
 
 def _bounds(points: FloatArray) -> FloatArray:
     """Return (2, 3): the lowest and the highest coordinates of `points` (N, 3), at least one."""
-    columns = np.ascontiguousarray(points.T)  # NumPy takes 20 times longer for extremes down columns of rows of three
+    columns = np.ascontiguousarray(points.T)  # NumPy is 20 times slower along the columns of an (N, 3) array
     return np.stack([columns.min(axis=1), columns.max(axis=1)])
 
 
@@ -591,5 +595,5 @@ def _lengths(vectors: FloatArray) -> FloatArray:
     return np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
 
 
-def _some(count: int, one: str, many: str) -> str:
-    return f"{count} {one if count == 1 else many}"
+def _format_count(count: int, singular: str, plural: str) -> str:
+    return f"{count} {singular if count == 1 else plural}"

@@ -1,8 +1,8 @@
-"""A surface spread out on the unit square, so that functions on the square describe it.
+"""Parameterisation of a surface on the unit square, so that functions on the square describe the surface.
 
-`disc_map` is one-to-one for every surface that is a disc but for holes (Tutte 1963; Floater, Math. Comp. 72, 2003):
-its rim lies on a convex curve, every other vertex is an average of its neighbours with positive weights, and each hole
-is closed by one vertex of its own. `cylinder_map` is the height field to compare with: it overlaps where a line from
+`disc_map` is one-to-one for every surface that is a disc with or without holes (Tutte 1963; Floater, Math. Comp. 72,
+2003): its rim is on a convex curve, every other vertex is an average of its neighbours with positive weights, and each
+hole is closed by an additional vertex. `cylinder_map` is a height field for comparison: it overlaps where a line from
 the axis meets the surface more than once.
 """
 
@@ -20,37 +20,38 @@ from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
 _ROUNDNESS = 4.0
 """Exponent of the rim |x|^p + |y|^p = 1: strictly convex, and 93 % of the square (a circle has 79 %)."""
 _LEAST_GAIN = 2e-3  # relative decrease of the stretch below which iterations end
-_SMALLEST = 1e-3  # share of the mean area that smaller triangles count as, so that their weights stay finite
+_SMALLEST = 1e-3  # share of the mean area; smaller triangles count as this area, so that their weights stay finite
 _TINY = 1e-9  # guard of divisions; areas and stretches are near 1
 
 
 def disc_map(mesh: Mesh, *, most_rounds: int = 40) -> FloatArray:
-    """Return where each vertex lies on the unit square, (V, 2): one-to-one, with room for what is finely triangulated.
+    """Return a one-to-one map (V, 2) of the vertices to the unit square, with more area for finely triangulated parts.
 
-    Weights are mean value coordinates (Floater, CAGD 20, 2003), which are positive on any triangles, divided round by
-    round by the stretch at the neighbour (Yoshizawa, Belyaev and Seidel, Shape Modeling International 2004). They
-    stay positive, so the map stays one-to-one, and pockets such as nostrils get room. Stretch counts more in small
-    triangles, so that room goes half by area and half by number of triangles: with that, B-splines of 32x32 control
-    points are 14 % nearer to faces of ICT-FaceKit, and 29 % to the bundled ones, than with room by area alone.
+    Weights are mean value coordinates (Floater, CAGD 20, 2003), which are positive for any triangles, divided in
+    each iteration by the stretch at the neighbour (Yoshizawa, Belyaev and Seidel, Shape Modeling International 2004).
+    They stay positive, so the map stays one-to-one, and pockets such as nostrils get more area. Stretch counts more in
+    small triangles, so that the area on the square depends equally on surface area and on number of triangles: the
+    error of B-splines of 32x32 control points is then 14 % smaller on faces of ICT-FaceKit, and 29 % smaller on the
+    bundled faces, than with surface area only.
 
     Args:
-        mesh: one piece with a rim and any number of holes, the longest border taken for the rim.
-        most_rounds: cap; 1 gives mean value coordinates alone. About three are used.
+        mesh: a surface of one piece with a rim (its longest border) and any number of holes.
+        most_rounds: limit of the iterations; 1 for mean value coordinates only. About three are used.
 
     Raises:
-        MeshError: it is no such surface: no triangles, several pieces, closed, edges of three triangles, handles.
+        MeshError: the surface has no triangles, several pieces, no border, edges of three triangles, or handles.
     """
     faces = faces_of(mesh)
-    vertices, filled, rim = _closed_up(mesh, faces)
-    pinned = _on_rim(vertices, faces, rim)
+    vertices, filled, rim = _close_holes(mesh, faces)
+    pinned = _place_rim(vertices, faces, rim)
     weights = _mean_value_weights(vertices, filled)
     area = _doubled_areas(vertices, filled)
     wanted = np.sqrt(area.mean() / np.maximum(area, _SMALLEST * area.mean()))
     best: tuple[float, FloatArray | None] = (np.inf, None)
     for _ in range(most_rounds):
-        uv = _averaged(weights, rim, pinned)
-        if (_turning(uv, filled) <= 0).any():
-            break  # so much stretch that rounding folds it
+        uv = _solve_averages(weights, rim, pinned)
+        if (_signed_areas(uv, filled) <= 0).any():
+            break  # the stretch is so large that rounding folds triangles
         squared = wanted * _squared_stretch(vertices, uv, filled)
         mean_stretch = float(np.sqrt((area * squared).sum() / area.sum()))
         if mean_stretch > best[0] * (1 - _LEAST_GAIN):
@@ -66,18 +67,19 @@ def disc_map(mesh: Mesh, *, most_rounds: int = 40) -> FloatArray:
         weights = weights.multiply(1.0 / np.maximum(stretch, _TINY)[None, :]).tocsr()
     if best[1] is None:
         raise MeshError(
-            f"{mesh.name}: its surface cannot be spread out on a square, since triangles fold over; repair it, or use "
+            f"{mesh.name}: its surface cannot be mapped to a square, since triangles fold over; repair it, or use "
             "--representation vertices."
         )
     return np.ascontiguousarray(best[1][: len(mesh.vertices)])
 
 
 def cylinder_map(mesh: Mesh, axis: int = 1) -> FloatArray:
-    """Return angle about an axis and height along it, (V, 2), each scaled to [0, 1]; nothing keeps it one-to-one.
+    """Return angle about an axis and height along it, (V, 2), each scaled to [0, 1]; the map may not be one-to-one.
 
     Args:
-        mesh: with or without triangles.
-        axis: of the frame, 0 to 2; the cylinder's centre is that of the circle nearest to the vertices seen along it.
+        mesh: a mesh, with or without triangles.
+        axis: index of the axis of the frame, 0 to 2; the centre of the cylinder is that of the circle fitted to the
+            vertices in projection along the axis.
     """
     x = mesh.vertices[:, [(axis + 2) % 3, (axis + 1) % 3]] if axis == 1 else np.delete(mesh.vertices, axis, axis=1)
     columns = np.column_stack([2 * x, np.ones(len(x))])
@@ -90,17 +92,17 @@ def cylinder_map(mesh: Mesh, axis: int = 1) -> FloatArray:
 
 
 def folded_triangles(uv: FloatArray, faces: IntArray) -> BoolArray:
-    """Return (F,) True for triangles that lie on the square the other way round than most, or without area.
+    """Return (F,) True for triangles whose orientation on the square is opposite to the majority, or without area.
 
     Args:
-        uv: (V, 2) of the vertices.
-        faces: (F, 3).
+        uv: (V, 2) positions of the vertices on the square.
+        faces: (F, 3) triangles.
     """
-    turning = _turning(uv, faces)
+    turning = _signed_areas(uv, faces)
     return turning * np.sign(np.median(np.sign(turning))) <= 0
 
 
-def _turning(uv: FloatArray, faces: IntArray) -> FloatArray:
+def _signed_areas(uv: FloatArray, faces: IntArray) -> FloatArray:
     a, b, c = uv[faces[:, 0]], uv[faces[:, 1]], uv[faces[:, 2]]
     p, q = b - a, c - a
     return p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
@@ -113,21 +115,21 @@ def _doubled_areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
 
 def _squared_stretch(vertices: FloatArray, uv: FloatArray, faces: IntArray) -> FloatArray:
     """Return (F,) mean squared length on the surface of a unit step on the square (Sander et al., SIGGRAPH 2001)."""
-    turning = _turning(uv, faces)[:, None]
+    turning = _signed_areas(uv, faces)[:, None]
     x, s = vertices[faces], uv[faces]
     along_u = sum(x[:, k] * (s[:, k - 2, 1] - s[:, k - 1, 1])[:, None] for k in range(3)) / turning
     along_v = sum(x[:, k] * (s[:, k - 1, 0] - s[:, k - 2, 0])[:, None] for k in range(3)) / turning
     return 0.5 * ((along_u**2).sum(axis=1) + (along_v**2).sum(axis=1))
 
 
-def _closed_up(mesh: Mesh, faces: IntArray) -> tuple[FloatArray, IntArray, IntArray]:
-    """Return vertices and triangles with every hole closed by a fan about a vertex of its own, and the rim (R,)."""
-    from scipy.sparse import coo_matrix  # takes a moment, which models of vertices need not wait for
+def _close_holes(mesh: Mesh, faces: IntArray) -> tuple[FloatArray, IntArray, IntArray]:
+    """Return vertices and triangles with each hole closed by a fan about an additional vertex, and the rim (R,)."""
+    from scipy.sparse import coo_matrix  # slow import, not needed for models of vertices
     from scipy.sparse.csgraph import connected_components
 
     name, count = mesh.name, len(mesh.vertices)
     if not np.isfinite(mesh.vertices).all():
-        raise MeshError(f"{name}: vertices that are not finite have no place on a square; fill or remove them.")
+        raise MeshError(f"{name}: vertices that are not finite cannot be mapped to a square; fill or remove them.")
     advice = "a B-spline surface needs one sheet with a rim; crop or repair it, or use --representation vertices."
     if np.bincount(faces.ravel(), minlength=count).min() == 0:
         raise MeshError(f"{name}: some vertices belong to no triangle, but {advice}")
@@ -139,7 +141,7 @@ def _closed_up(mesh: Mesh, faces: IntArray) -> tuple[FloatArray, IntArray, IntAr
     keys = start * count + end
     if len(np.unique(keys)) < len(keys):
         raise MeshError(
-            f"{name}: an edge has more than two triangles, or neighbours that face opposite ways, but {advice}"
+            f"{name}: an edge has more than two triangles, or neighbours with opposite orientation, but {advice}"
         )
     open_side = np.logical_not(np.isin(end * count + start, keys))
     if not open_side.any():
@@ -162,7 +164,7 @@ def _closed_up(mesh: Mesh, faces: IntArray) -> tuple[FloatArray, IntArray, IntAr
 
 
 def _loops(start: npt.NDArray[np.int64], end: npt.NDArray[np.int64]) -> list[IntArray] | None:
-    """Return the closed borders, each (n,) in the direction of its triangles; None if two meet at a vertex."""
+    """Return the closed borders (n,), each in the direction of its triangles; None if two meet at a vertex."""
     following = dict(zip(start.tolist(), end.tolist(), strict=True))
     if len(following) < len(start):
         return None
@@ -175,8 +177,8 @@ def _loops(start: npt.NDArray[np.int64], end: npt.NDArray[np.int64]) -> list[Int
     return loops
 
 
-def _on_rim(vertices: FloatArray, faces: IntArray, rim: IntArray) -> FloatArray:
-    """Return (R, 2) where the rim's vertices lie: by length along it, turned as the surface lies in its main plane."""
+def _place_rim(vertices: FloatArray, faces: IntArray, rim: IntArray) -> FloatArray:
+    """Return the positions (R, 2) of the rim vertices by arc length, oriented as the surface in its main plane."""
     points = vertices[rim]
     steps = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
     steps = np.maximum(steps, _TINY * steps.sum())
@@ -188,7 +190,7 @@ def _on_rim(vertices: FloatArray, faces: IntArray, rim: IntArray) -> FloatArray:
         centred = centred - np.outer(centred @ normal, normal)
     main = np.linalg.svd(centred, full_matrices=False)[2][0]
     main = main * np.sign(main[np.argmax(np.abs(main))])
-    # The first harmonic of the rim tells at which angle it starts.
+    # The first harmonic of the rim determines the angle at its start.
     plane = centred @ np.cross(main, normal) + 1j * (centred @ main)
     phase = np.angle((plane * np.exp(-2j * np.pi * position) * steps).sum()) / (2 * np.pi)
     angle = np.linspace(0.0, 2 * np.pi, 4097)
@@ -204,7 +206,7 @@ def _rim_curve(angle: FloatArray) -> FloatArray:
 
 
 def _mean_value_weights(vertices: FloatArray, faces: IntArray) -> Any:
-    """Return the sparse (V, V) weights that each row's vertex gives its neighbours, positive everywhere."""
+    """Return the sparse (V, V) positive weights of the neighbours (columns) of each vertex (row)."""
     from scipy.sparse import coo_matrix
 
     rows: list[IntArray] = []
@@ -225,8 +227,8 @@ def _mean_value_weights(vertices: FloatArray, faces: IntArray) -> Any:
     return coo_matrix(every, (len(vertices), len(vertices))).tocsr()
 
 
-def _averaged(weights: Any, rim: IntArray, pinned: FloatArray) -> FloatArray:
-    """Return (V, 2): the rim at `pinned`, every other vertex the weighted average of its neighbours."""
+def _solve_averages(weights: Any, rim: IntArray, pinned: FloatArray) -> FloatArray:
+    """Return positions (V, 2): the rim at `pinned`, every other vertex at the weighted average of its neighbours."""
     from scipy.sparse.linalg import splu
 
     count = weights.shape[0]

@@ -1,8 +1,9 @@
-"""Exact nearest points by a kd-tree in float64, compiled; other compiled loops may search it point by point.
+"""Exact nearest points by a kd-tree in float64, compiled; other compiled loops can search it point by point.
 
-The tree is implicit: node n has the children 2n + 1 and 2n + 2, its 2^depth leaves share the points evenly, and all it
-stores are the points in leaf order and one tight box a node. A box is passed over when it lies farther than the best
-point so far; both distances are rounded alike, so the answer is that of brute force, and the lowest index of ties.
+The tree is implicit: node n has the children 2n + 1 and 2n + 2, its 2^depth leaves share the points evenly, and it
+stores only the points in leaf order and one tight box per node. A search skips boxes that are farther than the best
+point so far; both distances are rounded in the same way, so the result is that of brute force, and the lowest index of
+ties.
 Source: Friedman, Bentley and Finkel, ACM TOMS 3(3), 1977.
 """
 
@@ -16,22 +17,22 @@ from shapespace.compiled import compiled
 from shapespace.errors import InputError
 from shapespace.types import FloatArray, IntArray
 
-_LEAF_POINTS = 12  # points in a leaf, at most: all of them are compared, instead of another level of boxes
+_LEAF_POINTS = 12  # largest number of points in a leaf, all of which a search compares
 _BLOCK = 16
-"""Rows that `_select` compares before it swaps: fastest for 20,000 to 200,000 points."""
+"""Number of rows that `_select` compares before it swaps: fastest for 20,000 to 200,000 points."""
 NOTED = 2
-"""How many nearest points `follow_into` chooses from before it searches again."""
+"""Number of nearest points that `follow_into` stores for a query, and checks before it searches again."""
 STACK_SIZE = 128
 """Length of the float64 workspace that `nearest_one` and `nearest_few` need."""
 
 
 class KdArrays(NamedTuple):
-    """What a tree consists of, as compiled loops take it.
+    """Arrays of a tree, as arguments of compiled loops.
 
     Args:
         points: (N, 3) float64, in leaf order.
-        original: (N,) int32, the number each of `points` had when it was given.
-        row_of: (N,) int32, the row of `points` where each number is.
+        original: (N,) int32, the index of each of `points` in the input.
+        row_of: (N,) int32, the row of `points` of each input point.
         boxes: (2^(depth + 1) - 1, 6) float64, lowest and highest coordinates below each node.
         depth: number of splits from the root to a leaf.
     """
@@ -43,18 +44,19 @@ class KdArrays(NamedTuple):
     depth: int
 
 
-class Followed(NamedTuple):
-    """What lets queries that have moved a little find their answer without a search.
+class WarmStart(NamedTuple):
+    """Stored results that give queries with small movements their nearest points without a search.
 
-    Where a query was last searched, at its anchor, its nearest points were noted, and all others were at least `reach`
-    away. So long as its distance to the nearest of those noted and its way from the anchor make less than `reach`, no
-    other point can be nearer (Greenspan and Godin, 3DIM 2001, with more points than one).
+    At the last search for a query, from its anchor, the nearest points were stored, and all others were at least
+    `reach` away. While the sum of the distances from the query to the nearest stored point and to the anchor is less
+    than `reach`, no other point can be nearer (Greenspan and Godin, 3DIM 2001, here with several stored points).
 
     Args:
-        rows: (M, NOTED + 1) int32, rows of `KdArrays.points`, nearest to the anchor first, -1 where there are no
-            more; the last one is that at `reach`.
-        anchor: (M, 3) float64.
-        reach: (M,) float64, infinite where every point is noted, 0 where the query was never searched this way.
+        rows: (M, NOTED + 1) int32, rows of `KdArrays.points`, nearest to the anchor first, -1 if there are fewer
+            points; the last row is that of the point at `reach`.
+        anchor: (M, 3) float64, position of each query at its last search.
+        reach: (M,) float64, distance from the anchor; infinite if every point is stored, 0 if the query was never
+            searched.
     """
 
     rows: IntArray
@@ -63,21 +65,21 @@ class Followed(NamedTuple):
 
 
 class KdTree:
-    """Points to be searched.
+    """A search tree of points.
 
     Args:
-        points: (N, 3) float64, finite, at least one; they may repeat, or lie on a line or a plane.
-            A query looks at every repeat of its nearest point, so thousands of repeats are better merged before.
+        points: (N, 3) float64, finite, at least one; they may be repeated, or be on a line or a plane. A query compares
+            all copies of its nearest point, so merge thousands of copies before.
 
     Raises:
-        InputError: no points, of another shape, or not finite.
+        InputError: no points, another shape, or points that are not finite.
     """
 
     def __init__(self, points: FloatArray) -> None:
         if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
             raise InputError(f"A kd-tree needs points of the shape (N, 3), at least one, not {points.shape}.")
         if not np.isfinite(points).all():
-            raise InputError("A kd-tree needs finite points; drop those that are not.")
+            raise InputError("A kd-tree needs finite points; remove the others.")
         depth = max(0, int(np.ceil(np.log2(len(points) / _LEAF_POINTS))))
         ordered = np.array(points, dtype=np.float64, order="C")
         index = np.arange(len(points), dtype=np.int32)
@@ -86,13 +88,13 @@ class KdTree:
         row_of = np.empty_like(index)
         row_of[index] = np.arange(len(points), dtype=np.int32)
         self.arrays = KdArrays(ordered, index, row_of, boxes, depth)
-        """The tree as compiled loops take it."""
+        """Arrays of the tree, as arguments of compiled loops."""
 
     def moved(self, points: FloatArray) -> KdTree:
-        """Return the tree of `points` (N, 3), which these have become: its leaves hold the same ones.
+        """Return the tree with the points moved to `points` (N, 3), with the same points in each leaf.
 
-        Answers are as exact as those of a tree made anew, which takes several times as long and serves faster where
-        points have moved past each other.
+        Results are as exact as those of a new tree. Building a new tree takes several times as long, but its searches
+        are faster if points have moved past each other.
         """
         tree, old = object.__new__(KdTree), self.arrays
         boxes = np.empty_like(old.boxes)
@@ -105,12 +107,12 @@ class KdTree:
         """Return the index (M,) int32 of the point nearest to each query, and its squared distance (M,).
 
         Args:
-            queries: (M, 3) float64, finite.
-            guess: (M,) int32 points that may be near, such as the last answers, -1 for none; they save time and
-                change nothing.
+            queries: (M, 3) float64 query points, finite.
+            guess: (M,) int32 indices of points that may be near, such as the previous results, -1 for none; they save
+                time and do not change the result.
 
         Raises:
-            InputError: shapes that do not match, or a guess that is no point.
+            InputError: shapes that do not match, or a guess that is not the index of a point.
         """
         queries = writable(queries)
         guess = checked_guess(guess, len(queries), len(self.arrays.original))
@@ -119,32 +121,32 @@ class KdTree:
         return index, squared
 
     def follow(
-        self, queries: FloatArray, known: Followed | None = None
-    ) -> tuple[IntArray, FloatArray, FloatArray, Followed]:
-        """Return what `nearest` does, the points themselves (M, 3), and what is to be given as `known` next time.
+        self, queries: FloatArray, known: WarmStart | None = None
+    ) -> tuple[IntArray, FloatArray, FloatArray, WarmStart]:
+        """Return the results of `nearest`, the nearest points (M, 3), and the argument `known` of the next call.
 
-        For queries that keep moving: several times faster than `nearest` once they move less than the points are apart.
+        For moving queries, this is several times faster than `nearest` once they move less than the distance between
+        points.
 
         Args:
-            queries: (M, 3) float64, finite.
-            known: what the last call for these queries returned; None for the first. It is brought up to date in
-                place: it says what is true of the points, whatever the queries are.
+            queries: (M, 3) float64 query points, finite.
+            known: warm start from the last call for these queries; None for the first call. It is updated in place.
 
         Raises:
             InputError: shapes that do not match.
         """
         queries, m = writable(queries), len(queries)
         if known is None:
-            known = Followed(np.full((m, NOTED + 1), -1, dtype=np.int32), np.zeros((m, 3)), np.zeros(m))
+            known = WarmStart(np.full((m, NOTED + 1), -1, dtype=np.int32), np.zeros((m, 3)), np.zeros(m))
         elif len(known.reach) != m:
-            raise InputError(f"What is known of {len(known.reach)} queries cannot serve {m}.")
+            raise InputError(f"The warm start of {len(known.reach)} queries does not match {m} queries.")
         nearest, squared, points = np.empty(m, dtype=np.int32), np.empty(m), np.empty((m, 3))
         follow_into(self.arrays, queries, known, nearest, squared, points)
         return nearest, squared, points, known
 
 
 def writable(queries: FloatArray) -> FloatArray:
-    """Return `queries` (M, 3) as compiled loops take them: a copy where writing is refused, which is a type of its own.
+    """Return `queries` (M, 3) as a writable array, copied if needed; read-only arrays are another type when compiled.
 
     Raises:
         InputError: another shape.
@@ -155,7 +157,7 @@ def writable(queries: FloatArray) -> FloatArray:
 
 
 def checked_guess(guess: IntArray | None, queries: int, count: int) -> IntArray:
-    """Return `guess` as (M,) int32 for as many `queries`, -1 throughout for None.
+    """Return `guess` as (M,) int32 for M = `queries`, all -1 for None.
 
     Raises:
         InputError: another shape, or an index that is not below `count`.
@@ -163,7 +165,7 @@ def checked_guess(guess: IntArray | None, queries: int, count: int) -> IntArray:
     if guess is None:
         return np.full(queries, -1, dtype=np.int32)
     if guess.shape != (queries,) or (queries and not (guess.min() >= -1 and guess.max() < count)):
-        raise InputError(f"A guess must be one index below {count} a query, or -1 for none.")
+        raise InputError(f"A guess must be one index below {count} per query, or -1 for none.")
     return np.require(guess, dtype=np.int32, requirements=["C", "W"])
 
 
@@ -171,10 +173,10 @@ def checked_guess(guess: IntArray | None, queries: int, count: int) -> IntArray:
 def _select(
     points: FloatArray, index: IntArray, low: int, high: int, middle: int, axis: int, left: IntArray, right: IntArray
 ) -> None:
-    """Reorder rows low to high - 1 so that none before `middle` is greater along `axis` and none after is less.
+    """Reorder rows low to high - 1 so that no row before `middle` is greater along `axis` and no row after it is less.
 
-    `left` and `right` (_BLOCK,) are workspace for rows to be swapped. They are found a block at a time, so that the
-    processor need not guess the comparisons (Edelkamp and Weiss, ESA 2016); the order is that of the plain loop.
+    `left` and `right` (_BLOCK,) are workspace for rows to be swapped. These are found in blocks, which avoids branch
+    mispredictions (Edelkamp and Weiss, ESA 2016); the order is that of the plain loop.
     """
     last = high - 1
     while low < last:
@@ -234,7 +236,7 @@ def order_into_leaves(points: FloatArray, index: IntArray, boxes: FloatArray, de
         width = depth - level
         for i in range(1 << level):
             low, high = ((i << width) * count) >> depth, (((i + 1) << width) * count) >> depth
-            # Plain numbers stay in registers, as the entries of an array that is written to do not.
+            # Scalars stay in registers, unlike entries of an array that is written to.
             x0, y0, z0 = points[low, 0], points[low, 1], points[low, 2]
             x1, y1, z1 = x0, y0, z0
             for row in range(low + 1, high):
@@ -251,7 +253,7 @@ def order_into_leaves(points: FloatArray, index: IntArray, boxes: FloatArray, de
 
 @compiled
 def cover_children(boxes: FloatArray, first_leaf: int) -> None:
-    """Fill the `boxes` before `first_leaf`, each around its two children, from those of the leaves."""
+    """Fill the `boxes` before `first_leaf`, each around its two children, starting from those of the leaves."""
     for node in range(first_leaf - 1, -1, -1):
         for k in range(3):
             boxes[node, k] = min(boxes[2 * node + 1, k], boxes[2 * node + 2, k])
@@ -275,7 +277,7 @@ def _boxes_of_leaves(points: FloatArray, boxes: FloatArray, depth: int) -> None:
 
 @compiled
 def box_distance(boxes: FloatArray, node: int, x: float, y: float, z: float) -> float:
-    """Return the squared distance of (x, y, z) from box `node`, never more than that of any point in it."""
+    """Return the squared distance of (x, y, z) from box `node`, which is at most that of any point in the box."""
     dx, ex = boxes[node, 0] - x, x - boxes[node, 3]
     dy, ey = boxes[node, 1] - y, y - boxes[node, 4]
     dz, ez = boxes[node, 2] - z, z - boxes[node, 5]
@@ -296,9 +298,9 @@ def start_at(
     squared: float,
     stack: FloatArray,
 ) -> tuple[int, int]:
-    """Return the leaf of `row`, of `count` rows, and the top of `stack`, which gets what else may lie within `squared`.
+    """Return the leaf of `row`, of `count` rows, and the top of `stack`, with other boxes that may be within `squared`.
 
-    Half of the boxes that a search from the root would measure, and hardly a branch that goes wrong.
+    This computes half as many box distances as a search from the root, with few mispredicted branches.
     """
     leaf = (((row + 1) << depth) - 1) // count + (1 << depth) - 1
     top = 0
@@ -316,12 +318,12 @@ def nearest_one(tree: KdArrays, x: float, y: float, z: float, guess: int, stack:
     """Return the index of the point nearest to (x, y, z) and its squared distance.
 
     Args:
-        tree: the points.
-        x: coordinates of the query,
-        y: in the unit
-        z: of the points.
-        guess: a point that may be near, or -1.
-        stack: (STACK_SIZE,) float64 workspace, one a thread.
+        tree: arrays of the tree of points.
+        x: x coordinate of the query, in the unit of the points.
+        y: y coordinate of the query.
+        z: z coordinate of the query.
+        guess: index of a point that may be near, or -1.
+        stack: (STACK_SIZE,) float64 workspace, one per thread.
     """
     points, index, boxes, depth = tree.points, tree.original, tree.boxes, tree.depth
     count, first_leaf = len(index), (1 << depth) - 1
@@ -387,15 +389,15 @@ def nearest_few(
     """Write the rows of the nearest points and their squared distances, nearest first, the lowest index of ties.
 
     Args:
-        tree: the points.
-        x: coordinates of the query,
-        y: in the unit
-        z: of the points.
-        limit: squared distance within which there are surely as many points as `rows` takes; infinity if unknown.
+        tree: arrays of the tree of points.
+        x: x coordinate of the query, in the unit of the points.
+        y: y coordinate of the query.
+        z: z coordinate of the query.
+        limit: squared distance within which there are certainly at least k points; infinity if unknown.
         start: row of a point that may be near, or -1.
-        rows: (k,) int32 to be written, -1 where there are fewer points.
-        squared: (k,) to be written, infinite there.
-        stack: (STACK_SIZE,) float64 workspace, one a thread.
+        rows: (k,) int32 output, -1 if there are fewer points.
+        squared: (k,) float64 output, infinite if there are fewer points.
+        stack: (STACK_SIZE,) float64 workspace, one per thread.
     """
     points, index, boxes, depth = tree.points, tree.original, tree.boxes, tree.depth
     count, first_leaf, last = len(index), (1 << depth) - 1, len(rows) - 1
@@ -447,12 +449,12 @@ def nearest_few(
 def follow_into(
     tree: KdArrays,
     queries: FloatArray,
-    known: Followed,
+    known: WarmStart,
     index_out: IntArray,
     squared_out: FloatArray,
     points_out: FloatArray,
 ) -> None:
-    """Write what `KdTree.follow` returns, and into `known` what was found."""
+    """Write the results of `KdTree.follow` to the output arrays, and update `known`."""
     points, stack, noted_squared = tree.points, np.empty(STACK_SIZE), np.empty(NOTED + 1)
     for i in range(len(queries)):
         x, y, z = queries[i, 0], queries[i, 1], queries[i, 2]
@@ -467,9 +469,9 @@ def follow_into(
             d = dx * dx + dy * dy + dz * dz
             if d < squared or (d == squared and tree.original[row] < tree.original[best]):
                 best, squared = row, d
-        # Rounding must not let a tie pass for a clear case.
+        # The margin excludes ties up to rounding.
         if np.sqrt(squared) + way >= reach * (1.0 - 1e-12):
-            # All that were noted lie within this, so the search may start with it.
+            # All stored points are within this distance, so the search can start with it.
             far = way + reach if known.rows[i, NOTED] >= 0 else np.inf
             nearest_few(tree, x, y, z, far * far * (1.0 + 1e-12), known.rows[i, 0], known.rows[i], noted_squared, stack)
             best, squared = known.rows[i, 0], noted_squared[0]

@@ -28,7 +28,7 @@ SlidingCriterion: TypeAlias = Literal["bending-energy", "procrustes"]
 MissingMethod: TypeAlias = Literal["tps", "regression", "refuse"]
 
 _ITERATIONS, _SLIDING_ITERATIONS = 5, 10
-"""Largest numbers of iterations without and with semilandmarks, those of `gpagen`."""
+"""Largest numbers of iterations without and with semilandmarks, as in `gpagen`."""
 _NEIGHBOURS = 5  # landmarks, the sliding one among them, whose principal axes span the tangent plane; as in `gpagen`
 _FLAT = 1e-9  # ratio of singular values; landmarks nearer to a line than rounding
 _MOST_MISSING = 0.5  # share of the specimens that may lack a landmark
@@ -37,9 +37,9 @@ _OUTLIER = 2.5, 0.5
 """Robust standard score of an outlier: a constant, and a factor of the logarithm of the number of landmarks, since the
 largest of more displacements has a longer tail; 5 % of clean sets of 20 to 400 specimens exceed it (simulated)."""
 _MAD = 1.4826  # standard deviations of a normal distribution in a median absolute deviation
-_LEAST_SPREAD = 0.01  # of log displacements; specimens within 1 % of each other are alike
-_MATCHING_ITERATIONS = 20  # of starts of curves and mean in turns; simulated outlines need 3 to 8
-_STILL = 1e-3  # points by which a start still moves, below the accuracy of a digitised outline
+_LEAST_SPREAD = 0.01  # of log displacements; specimens within 1 % of each other do not differ
+_MATCHING_ITERATIONS = 20  # limit; alternates starts of curves and mean; simulated outlines need 3 to 8
+_STILL = 1e-3  # movement of a start, in points, that ends the iteration; below digitisation accuracy
 _ROUNDING = 1e-9  # of the size; displacements below it are rounding
 _MIRRORED, _SWAPPED = 0.5, 0.6
 """A specimen is mirrored, or has swapped landmarks, if reflection or exchange reduces its Procrustes distance to this
@@ -61,14 +61,15 @@ class AlignConfig:
             where at most as many landmarks as dimensions do not slide, procrustes, because affine movements of all
             points along a curve have no bending energy)
         missing: estimation of missing landmarks from complete specimens: by thin-plate spline of their mean (`tps`), by
-            `regression` on the scores of partial least squares, or `refuse`.
+            `regression` on the scores of partial least squares. The third choice of `MissingMethod` raises an error for
+            specimens with missing landmarks.
         structures: structure of each landmark; structures are aligned separately, and combined at their relative
             centroid sizes. None for one structure.
         tolerance: change of the summed squared distances from the mean, in units of the squared centroid size, that
             ends the alignment.
         iterations: largest number of iterations (default: 5, or 10 with semilandmarks, as in geomorph).
-        match_curves: move the start of closed curves, and reverse curves, where this brings a specimen nearer to the
-            mean; False keeps those of the file.
+        match_curves: whether to move the start of closed curves, and reverse curves, if this brings a specimen nearer
+            to the mean; False keeps starts and directions of the file.
 
     Example:
         >>> config = ss.geometry.AlignConfig(gauge="form")
@@ -102,19 +103,19 @@ class AlignedLandmarks:
     """Landmarks of N specimens after generalised Procrustes analysis.
 
     Args:
-        names: N specimens.
-        landmarks: L names.
+        names: N names of specimens.
+        landmarks: L names of landmarks.
         coords: (N, L, D) aligned coordinates with D 2 or 3.
         sizes: (N,) centroid sizes in the unit of the file.
         columns: name -> N cells of covariates.
         estimated: (N, L) True for missing landmarks, whose positions are estimates.
         gauge: `shape` or `form`.
         tangent: whether `coords` are projected onto the tangent space at their mean, as one structure.
-        unit: of `sizes`, and of `coords` in the gauge `form`: `mm`, or empty for none.
-        iterations: number of iterations; with separate structures the largest.
+        unit: unit of `sizes`, and of `coords` in the gauge `form`: `mm`, or empty if unknown.
+        iterations: number of iterations; with separate structures the largest one.
         converged: False if the iterations ended before the criterion was met.
-        where: what the data are called in messages.
-        notes: a sentence each.
+        where: name of the data in messages.
+        notes: sentences about the data and the alignment.
 
     Example:
         >>> aligned = ss.geometry.align_landmarks(configurations)
@@ -143,7 +144,7 @@ class AlignedLandmarks:
 
     @property
     def dimensions(self) -> int:
-        """2 or 3."""
+        """Dimension of the space, 2 or 3."""
         return int(self.coords.shape[2])
 
     @property
@@ -169,11 +170,11 @@ class LandmarkFinding:
     """A specimen to check.
 
     Args:
-        specimen: its name.
+        specimen: name of the specimen.
         reason: `outlier`, `swapped` (landmarks) or `mirrored`.
-        value: of an outlier, the displacement of its most displaced landmark in units of the median of this landmark;
-            or the share to which its Procrustes distance from the mean falls by exchange or reflection.
-        landmarks: the two swapped ones, or the most displaced one of an outlier.
+        value: displacement of the most displaced landmark of an outlier, in units of the median displacement of this
+            landmark; otherwise the share to which exchange or reflection reduces the Procrustes distance from the mean.
+        landmarks: names of the two swapped landmarks, or of the most displaced landmark of an outlier.
 
     Example:
         >>> findings = ss.geometry.find_outliers(ss.geometry.align_landmarks(configurations))
@@ -194,20 +195,20 @@ class LandmarkFinding:
             )
         fall = f"reduces its Procrustes distance from the mean to {100 * self.value:.0f} %"
         if self.reason == "mirrored":
-            return f"{self.specimen} is mirrored: reflection {fall}; reflect it, or leave it out."
+            return f"{self.specimen} is mirrored: reflection {fall}; reflect or exclude it."
         return f"{self.specimen}: exchange of the landmarks {' and '.join(self.landmarks)} {fall}; check their order."
 
 
 def align_landmarks(configurations: LandmarkConfigurations, config: AlignConfig | None = None) -> AlignedLandmarks:
-    """Return landmarks after generalised Procrustes analysis, missing ones estimated before it.
+    """Return landmarks after generalised Procrustes analysis; missing landmarks are estimated before.
 
     Args:
-        configurations: of two or more specimens.
-        config: None for the defaults.
+        configurations: landmarks of two or more specimens.
+        config: options of the alignment; None for the defaults.
 
     Raises:
-        InputError: one specimen, fewer than three landmarks, landmarks on a line, too many missing ones, sliders that
-            cannot be, or structures that do not name each landmark.
+        InputError: one specimen, fewer than three landmarks, landmarks on a line, too many missing landmarks, invalid
+            sliders, or structures that do not contain each landmark.
 
     Example:
         >>> ss.geometry.align_landmarks(configurations).coords.shape
@@ -216,14 +217,14 @@ def align_landmarks(configurations: LandmarkConfigurations, config: AlignConfig 
     config = with_criterion(config or AlignConfig(), configurations)
     if config.match_curves and len(configurations) > 1:
         configurations = match_curves(configurations)
-    points, notes = _complete(configurations, config)
-    _refuse_sliders(configurations)
+    points, notes = _estimate_missing(configurations, config)
+    _check_sliders(configurations)
     chosen = _structures(configurations, config)
     parts: list[Superimposition] = []
     sizes = np.zeros((len(chosen), len(points)))
     for row, members in enumerate(chosen):
         part = points[:, members]
-        _refuse_degenerate(part, configurations)
+        _check_degenerate(part, configurations)
         own = np.full(points.shape[1], -1, dtype=np.int32)
         own[members] = np.arange(len(members))
         curves = own[configurations.curve_sliders]
@@ -240,7 +241,7 @@ def align_landmarks(configurations: LandmarkConfigurations, config: AlignConfig 
     if not converged:
         notes.append(
             f"The alignment ended after {iterations} iterations, before the summed squared distances changed by less "
-            f"than {config.tolerance:g}, as gpagen of geomorph ends it; allow more with --set iterations=N."
+            f"than {config.tolerance:g}, as gpagen of geomorph ends it; increase the limit with --set iterations=N."
         )
     return AlignedLandmarks(
         names=configurations.names,
@@ -281,13 +282,13 @@ def superimpose(
     """Superimpose complete landmarks (N, L, D) by rotations, with semilandmarks that slide.
 
     The axes are the principal axes of the mean, each with a positive component on the original axis of its number; the
-    last axis is reversed where the set would be reflected otherwise.
+    last axis is reversed if the set would otherwise be reflected.
 
     Args:
-        points: in any poses and sizes.
-        config: of the alignment.
-        curves: (M, 3) landmarks before, sliding and after.
-        surface: (S,) landmarks that slide in tangent planes.
+        points: (N, L, D) landmarks in any poses and sizes.
+        config: options of the alignment.
+        curves: (M, 3) indices of the landmarks before, sliding and after.
+        surface: (S,) indices of the landmarks that slide in tangent planes.
     """
     n = len(points)
     curves = np.zeros((0, 3), np.int32) if curves is None else curves
@@ -297,7 +298,7 @@ def superimpose(
     size = np.linalg.norm(centred, axis=(1, 2))  # M1
     unit = np.sqrt((size**2).mean()) if config.gauge == "form" and not slides else size
     coords = centred / np.reshape(unit, (-1, 1, 1))
-    coords = _rotated(coords, coords[0])
+    coords = _rotate_to(coords, coords[0])
     mean = coords.mean(axis=0)
     most = config.iterations or (_SLIDING_ITERATIONS if slides else _ITERATIONS)
     squares, iterations = n * float((mean**2).sum()), 1
@@ -306,13 +307,13 @@ def superimpose(
         iterations += 1
         if slides:
             B = None if config.slide_by == "procrustes" else bending_energy_matrix(mean)
-            slid = np.stack([_slid(x, mean, curves, surface, B) for x in coords])
+            slid = np.stack([_slide(x, mean, curves, surface, B) for x in coords])
             previous, squares = squares, n * float((slid.mean(axis=0) ** 2).sum())
-            coords = _rotated(slid, mean)
+            coords = _rotate_to(slid, mean)
             mean = coords.mean(axis=0)
             mean = mean / np.linalg.norm(mean - mean.mean(axis=0))
         else:
-            coords = _rotated(coords, mean)
+            coords = _rotate_to(coords, mean)
             mean = coords.mean(axis=0)
             previous, squares = squares, n * float((mean**2).sum())
         converged = abs(previous - squares) <= config.tolerance  # M3
@@ -329,15 +330,15 @@ def superimpose(
 
 
 def match_curves(configurations: LandmarkConfigurations, mean: FloatArray | None = None) -> LandmarkConfigurations:
-    """Return landmarks whose curves start at the same place and run in the same direction in all specimens.
+    """Return landmarks whose curves have corresponding starts and directions in all specimens.
 
-    The start of a closed curve is anywhere between its points, where the Procrustes distance from the mean is least. A
-    closed curve in the plane runs round as in the mean, another one as the distance from the mean is less. An open
-    curve is reversed if this halves its distance from the mean. Curves with missing points stay as they are.
+    The start of a closed curve may be between its points, at the smallest Procrustes distance from the mean. A closed
+    curve in the plane has the direction of the mean, and in 3-D the direction with the smaller distance from the mean.
+    An open curve is reversed if this halves its distance from the mean. Curves with missing points are unchanged.
 
     Args:
-        configurations: of specimens in any poses and sizes.
-        mean: (L, D) to match; None for the mean of the specimens, found in turns with the starts.
+        configurations: landmarks of specimens in any poses and sizes.
+        mean: (L, D) landmarks to match; None for the mean of the specimens, computed in alternation with the starts.
     """
     points, curves = configurations.points, [(np.array(at), closed) for at, closed in configurations.curves]
     usable = np.array([[len(at) > 2 and np.isfinite(x[at]).all() and np.ptp(x[at]) > 0 for at, _ in curves]
@@ -355,41 +356,41 @@ def match_curves(configurations: LandmarkConfigurations, mean: FloatArray | None
         change = 0.0
         for k, c in np.argwhere(usable).tolist():
             at, closed = curves[c]
-            # In the first step, a curve is placed by the landmarks and by the curves before it.
+            # In the first step, a curve is aligned by the landmarks and the preceding curves.
             known = np.isfinite(moved[k]).all(axis=1)
             known[on_curves[on_curves.index(at[0]) :] if step == 0 else at] = False
             by, reverse = _best_start(moved[k], target, known, at, closed)
             is_reversed[k, c] ^= reverse
-            # Numbers of points run backwards along a reversed curve.
+            # The order of points is backwards along a reversed curve.
             shift[k, c] += -by if is_reversed[k, c] else by
             if by or reverse:
-                moved[k, at] = _restarted(points[k, at], shift[k, c], bool(is_reversed[k, c]), closed)
+                moved[k, at] = _restart_curve(points[k, at], shift[k, c], bool(is_reversed[k, c]), closed)
             change = max(change, abs(by), float(reverse))
         if change < _STILL:
             break
     notes = list[str]()
     for c, (at, closed) in enumerate(curves):
-        # Fewer specimens are digitised in the other direction.
+        # The direction of the majority of specimens is kept.
         if mean is None and 2 * is_reversed[:, c].sum() > len(points):
             for k in np.flatnonzero(usable[:, c]).tolist():
                 moved[k, at] = moved[k, np.append(at[0], at[:0:-1]) if closed else at[::-1]]
                 is_reversed[k, c] ^= True
         if is_reversed[:, c].any():
             names = list_briefly([configurations.names[k] for k in np.flatnonzero(is_reversed[:, c]).tolist()])
-            notes.append(f"Curve {c + 1} runs in the other direction in {names}, and is reversed there.")
+            notes.append(f"Curve {c + 1} has the opposite direction in {names}, and is reversed there.")
     if any(closed for _, closed in curves):
-        notes.append("Closed curves start where they fit the mean best; match_curves=no keeps their first points.")
+        notes.append("Closed curves start at the best fit to the mean; match_curves=no keeps their first points.")
     return replace(configurations, points=read_only(moved), notes=(*configurations.notes, *notes))
 
 
 def _best_start(x: FloatArray, mean: FloatArray, known: BoolArray, at: IntArray, closed: bool) -> tuple[float, bool]:
-    """Return by how many points, and whether reversed before, a curve fits the mean best, with the `known` points."""
+    """Return the shift of the start (in points) and the reversal with which a curve and `known` points fit best."""
     own, target, n = x[at], mean[at], int(known.sum()) + len(at)
     base = x[known].T @ mean[known] - np.outer(x[known].sum(axis=0) + own.sum(axis=0),
                                                mean[known].sum(axis=0) + target.sum(axis=0)) / n  # fmt: skip
     orders = [own, np.roll(own[::-1], 1, axis=0) if closed else own[::-1]]
     same_area = _area(target) * _area(own) if closed and x.shape[1] == 2 else 0.0
-    # Sums over the points for all starts, by the theorem of correlation.
+    # Sums over the points for all starts, by the correlation theorem.
     spectrum = np.conj(np.fft.rfft(target, axis=0))[:, None, :]
     products = np.stack([
         np.fft.irfft(np.fft.rfft(order, axis=0)[:, :, None] * spectrum, n=len(at), axis=0)[: None if closed else 1]
@@ -400,9 +401,9 @@ def _best_start(x: FloatArray, mean: FloatArray, known: BoolArray, at: IntArray,
         away = list[float]()
         for order, rotation in zip(orders, R, strict=True):
             both = np.concatenate([x[known], order]) @ rotation.T, np.concatenate([mean[known], target])
-            one, two = (part - part.mean(axis=0) for part in both)
-            one = one * ((one * two).sum() / (one**2).sum())
-            away.append(float(np.linalg.norm((one - two)[-len(at) :])))
+            own, other = (part - part.mean(axis=0) for part in both)
+            own = own * ((own * other).sum() / (own**2).sum())
+            away.append(float(np.linalg.norm((own - other)[-len(at) :])))
         return 0.0, away[1] < _MIRRORED * away[0]
     singular = np.linalg.svd(products, compute_uv=False)
     score = singular.sum(axis=2) - 2 * singular[..., -1] * (np.linalg.det(products) < 0)
@@ -415,7 +416,7 @@ def _best_start(x: FloatArray, mean: FloatArray, known: BoolArray, at: IntArray,
     return (start + fraction + len(at) / 2) % len(at) - len(at) / 2, order == 1
 
 
-def _restarted(own: FloatArray, shift: float, is_reversed: bool, closed: bool) -> FloatArray:
+def _restart_curve(own: FloatArray, shift: float, is_reversed: bool, closed: bool) -> FloatArray:
     """Return a curve (P, D) reversed, and then started `shift` points later, by periodic cubic splines."""
     if not closed:
         return own[::-1] if is_reversed else own
@@ -437,8 +438,8 @@ def project_to_tangent(coords: FloatArray, mean: FloatArray | None = None) -> Fl
     """Return shapes (N, L, D) of unit centroid size projected orthogonally onto the tangent space at their mean.
 
     Args:
-        coords: aligned.
-        mean: (L, D) of another set; None for that of `coords`.
+        coords: (N, L, D) aligned shapes.
+        mean: (L, D) mean of another set; None for that of `coords`.
     """
     middle: FloatArray = coords.mean(axis=0) if mean is None else mean
     middle = (middle - middle.mean(axis=0)) / np.linalg.norm(middle - middle.mean(axis=0))
@@ -446,15 +447,15 @@ def project_to_tangent(coords: FloatArray, mean: FloatArray | None = None) -> Fl
     return coords + (1.0 - along)[:, None, None] * middle  # M4
 
 
-def _rotated(coords: FloatArray, target: FloatArray) -> FloatArray:
+def _rotate_to(coords: FloatArray, target: FloatArray) -> FloatArray:
     """Return `coords` (N, L, D) rotated to `target` (L, D) by least squares."""
     return coords @ fit_rotations(np.einsum("nli,lj->nij", coords, target)).transpose(0, 2, 1)  # M2
 
 
-def _slid(x: FloatArray, mean: FloatArray, curves: IntArray, surface: IntArray, B: FloatArray | None) -> FloatArray:
-    """Return a specimen (L, D) with its semilandmarks moved along its own tangents.
+def _slide(x: FloatArray, mean: FloatArray, curves: IntArray, surface: IntArray, B: FloatArray | None) -> FloatArray:
+    """Return a specimen (L, D) with its semilandmarks moved along its tangents.
 
-    They minimise the bending energy, by its matrix `B` (L, L), or the Procrustes distance if that is None.
+    The movements minimise the bending energy with matrix `B` (L, L), or the Procrustes distance if `B` is None.
     """
     tangents = x[curves[:, 2]] - x[curves[:, 0]]
     lengths = np.linalg.norm(tangents, axis=1, keepdims=True)
@@ -480,14 +481,14 @@ def _slid(x: FloatArray, mean: FloatArray, curves: IntArray, surface: IntArray, 
 
 
 def find_outliers(aligned: AlignedLandmarks) -> tuple[LandmarkFinding, ...]:
-    """Return the specimens that are mirrored, that have swapped landmarks, or that lie far from the mean.
+    """Return the specimens that are mirrored, have swapped landmarks, or are far from the mean.
 
-    Distances are from the median of the coordinates, which few specimens cannot move. The score of a specimen is the
-    logarithm of its largest displacement of a landmark, relative to the median of that landmark, so that variation
-    which many landmarks share hides no displaced one.
+    Distances are from the median of the coordinates, which is robust to few outliers. The score of a specimen is the
+    logarithm of its largest displacement of a landmark, relative to the median displacement of that landmark, so that
+    variation of many landmarks does not hide a displaced landmark.
 
     Args:
-        aligned: three or more specimens; with fewer nothing is found.
+        aligned: aligned landmarks of three or more specimens; with fewer the result is empty.
 
     Example:
         >>> findings = ss.geometry.find_outliers(ss.geometry.align_landmarks(configurations))
@@ -502,9 +503,9 @@ def find_outliers(aligned: AlignedLandmarks) -> tuple[LandmarkFinding, ...]:
     x = x / np.linalg.norm(x, axis=(1, 2))[:, None, None]
 
     def distances(shapes: FloatArray) -> FloatArray:
-        return np.linalg.norm(_rotated(shapes, middle) - middle, axis=(1, 2))
+        return np.linalg.norm(_rotate_to(shapes, middle) - middle, axis=(1, 2))
 
-    displacements = np.linalg.norm(_rotated(x, middle) - middle, axis=2)
+    displacements = np.linalg.norm(_rotate_to(x, middle) - middle, axis=2)
     own = np.linalg.norm(displacements, axis=1)
     moved = np.maximum(displacements, _ROUNDING)
     moved /= np.median(moved, axis=0)
@@ -548,14 +549,14 @@ def _swaps(x: FloatArray, middle: FloatArray, least: float) -> list[IntArray]:
     return orders
 
 
-def _complete(configurations: LandmarkConfigurations, config: AlignConfig) -> tuple[FloatArray, list[str]]:
+def _estimate_missing(configurations: LandmarkConfigurations, config: AlignConfig) -> tuple[FloatArray, list[str]]:
     """Return the points (N, L, D) with estimates of missing landmarks, and notes on them."""
     points, where = configurations.points, configurations.where
     observed, (n, L, D) = configurations.observed, configurations.points.shape
     if n < 2:
         raise InputError(f"{where}: one specimen cannot be aligned; give two or more.")
     if L < 3:
-        raise InputError(f"{where}: {L} landmarks have no shape; three are the least.")
+        raise InputError(f"{where}: {L} landmarks have no shape; at least three are needed.")
     if np.isinf(points).any():
         raise InputError(f"{where}: a coordinate is infinite; correct it, or leave it empty if it is missing.")
     missing = ~observed
@@ -565,7 +566,7 @@ def _complete(configurations: LandmarkConfigurations, config: AlignConfig) -> tu
     first = configurations.names[int(incomplete[0])]
     if config.missing == "refuse":
         raise InputError(
-            f"{where}: {len(incomplete)} of {n} specimens lack landmarks (such as {first}); leave these out, or "
+            f"{where}: {len(incomplete)} of {n} specimens lack landmarks (such as {first}); exclude these, or "
             "estimate the landmarks with --missing tps."
         )
     few = np.flatnonzero(observed.sum(axis=1) < D + 1)
@@ -573,7 +574,7 @@ def _complete(configurations: LandmarkConfigurations, config: AlignConfig) -> tu
         count, name = int(observed[few[0]].sum()), configurations.names[int(few[0])]
         raise InputError(
             f"{where}: {count or 'no'} landmark{'s are' if count != 1 else ' is'} observed of {name}, "
-            f"and {D + 1} are the least from which the others are estimated; leave it out."
+            f"and at least {D + 1} are needed to estimate the others; exclude this specimen."
         )
     share = missing.mean(axis=0)
     worst = int(np.argmax(share))
@@ -582,7 +583,7 @@ def _complete(configurations: LandmarkConfigurations, config: AlignConfig) -> tu
         problem = "" if share[worst] > _MOST_MISSING else f", and {len(complete)} specimens have all landmarks"
         raise InputError(
             f"{where}: landmark {configurations.landmarks[worst]} is missing in {int(missing[:, worst].sum())} of {n} "
-            f"specimens{problem}; leave that landmark, or the specimens without it, out."
+            f"specimens{problem}; exclude that landmark, or the specimens without it."
         )
     centred = points[complete] - points[complete].mean(axis=1, keepdims=True)
     form = superimpose(centred, AlignConfig()).coords * np.linalg.norm(centred, axis=(1, 2))[:, None, None]
@@ -593,11 +594,11 @@ def _complete(configurations: LandmarkConfigurations, config: AlignConfig) -> tu
             if config.missing == "tps":
                 out[k, ~seen] = ThinPlateSpline.fit(mean[seen], points[k, seen]).apply(mean[~seen])  # M8
             else:
-                out[k, ~seen] = _regressed(form, points[k], seen)
+                out[k, ~seen] = _estimate_by_regression(form, points[k], seen)
         except InputError as error:
             raise InputError(
                 f"{where}: the observed landmarks of {configurations.names[k]} do not determine the others, since they "
-                "lie on a line or a plane; leave it out."
+                "lie on a line or a plane; exclude this specimen."
             ) from error
     count = int(missing.sum())
     noun = "landmark is an estimate" if count == 1 else "landmarks are estimates"
@@ -605,13 +606,13 @@ def _complete(configurations: LandmarkConfigurations, config: AlignConfig) -> tu
     return out, [f"{count} missing {noun} ({config.missing}, from {len(complete)} complete specimens): {names}."]
 
 
-def _regressed(form: FloatArray, points: FloatArray, seen: BoolArray) -> FloatArray:
+def _estimate_by_regression(form: FloatArray, points: FloatArray, seen: BoolArray) -> FloatArray:
     """Return the missing landmarks (M, D) of a specimen by regression on PLS scores of the observed landmarks.
 
     Args:
         form: (n, L, D) complete specimens, aligned with their sizes.
-        points: (L, D) of the specimen.
-        seen: (L,) its observed landmarks.
+        points: (L, D) landmarks of the specimen.
+        seen: (L,) mask of its observed landmarks.
     """
     n, _, D = form.shape
     x, y = form[:, seen].reshape(n, -1), form[:, ~seen].reshape(n, -1)
@@ -626,7 +627,7 @@ def _regressed(form: FloatArray, points: FloatArray, seen: BoolArray) -> FloatAr
 
 
 def _structures(configurations: LandmarkConfigurations, config: AlignConfig) -> list[IntArray]:
-    """Return the landmarks of each structure."""
+    """Return the indices of the landmarks of each structure."""
     names = configurations.landmarks
     if config.structures is None:
         return [np.arange(len(names), dtype=np.int32)]
@@ -643,32 +644,32 @@ def _structures(configurations: LandmarkConfigurations, config: AlignConfig) -> 
         if len(set(structure[row])) > 1:
             raise InputError(f"{where}: landmark {names[row[1]]!r} slides between landmarks of different structures; "
                              "correct the sliders.")  # fmt: skip
-    return [np.flatnonzero(structure == one).astype(np.int32) for one in dict.fromkeys(structure.tolist())]
+    return [np.flatnonzero(structure == label).astype(np.int32) for label in dict.fromkeys(structure.tolist())]
 
 
-def _refuse_sliders(configurations: LandmarkConfigurations) -> None:
+def _check_sliders(configurations: LandmarkConfigurations) -> None:
     curves, surface = configurations.curve_sliders, configurations.surface_sliders
     where, L = configurations.where, len(configurations.landmarks)
     every = np.concatenate([curves.ravel(), surface])
     outside = every[(every < 0) | (every >= L)]
     if len(outside):
-        raise InputError(f"{where}: the sliders name landmark {int(outside[0]) + 1}, and there are {L}; correct them.")
+        raise InputError(f"{where}: the sliders contain landmark {int(outside[0]) + 1} of {L}; correct them.")
     sliding, counts = np.unique(np.concatenate([curves[:, 1], surface]), return_counts=True)
     if (counts > 1).any():
         name = configurations.landmarks[int(sliding[counts > 1][0])]
-        raise InputError(f"{where}: landmark {name} slides twice; name it once in the sliders.")
+        raise InputError(f"{where}: landmark {name} slides twice; list it once in the sliders.")
     repeated = curves[(curves[:, 0] == curves[:, 1]) | (curves[:, 2] == curves[:, 1]) | (curves[:, 0] == curves[:, 2])]
     if len(repeated):
         name = configurations.landmarks[int(repeated[0, 1])]
         raise InputError(f"{where}: landmark {name} needs two other landmarks, before and after, to slide between.")
     if len(surface) and configurations.dimensions == 2:
-        raise InputError(f"{where}: semilandmarks slide on surfaces in 3-D only; name curves for planar landmarks.")
+        raise InputError(f"{where}: semilandmarks slide on surfaces in 3-D only; use curves for planar landmarks.")
 
 
-def _refuse_degenerate(points: FloatArray, configurations: LandmarkConfigurations) -> None:
+def _check_degenerate(points: FloatArray, configurations: LandmarkConfigurations) -> None:
     if points.shape[1] < 3:
-        raise InputError(f"{configurations.where}: a structure of {points.shape[1]} landmarks has no shape; three are "
-                         "the least.")  # fmt: skip
+        raise InputError(f"{configurations.where}: a structure of {points.shape[1]} landmarks has no shape; at least "
+                         "three are needed.")  # fmt: skip
     spread = np.linalg.svd(points - points.mean(axis=1, keepdims=True), compute_uv=False)
     flat = np.flatnonzero(spread[:, 1] <= _FLAT * spread[:, 0])
     if len(flat):

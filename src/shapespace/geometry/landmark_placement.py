@@ -1,4 +1,4 @@
-"""Placing named points on a surface: the triangle that is closest to each, and barycentric coordinates in it."""
+"""Placement of named points on a surface: the closest triangle, and barycentric coordinates in this triangle."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from shapespace.reprs import first_names
 from shapespace.types import RAS_TO_LPS, FloatArray, Mesh, SurfaceLandmarks
 
 _FAR_SHARE = 0.01
-"""Share of the object's size (RMS): a landmark farther than this and than a mean edge is probably off the surface."""
+"""Share of the size of the object (RMS); a landmark farther than this and a mean edge is probably off the surface."""
 _NAMED = 10  # landmarks in a sentence
 STRAY = 0.25
-"""A landmark that lies farther than this share of a scan's size off its surface does not belong to it."""
+"""A landmark at a distance from a surface of more than this share of its size does not belong to the surface."""
 _TURNED_RATIO, _TURNED_SHARE, _FEWEST = 3.0, 0.05, 3
-"""Landmarks are turned if they are this many times nearer (RMS) after a half turn, and were farther off than this share
-of the size, or, fewer than three, than `STRAY`: errors of placing do not vanish by a half turn."""
+"""Landmarks are rotated if their distance (RMS) decreases by this factor by a half turn, and was larger than this share
+of the size, or than `STRAY` for fewer than three: a half turn does not remove errors of placement."""
 _TURNED = (
     "Its landmarks are a half turn about z from its surface, as between RAS and LPS, so the signs of their x and y are "
     "changed here; export both in LPS, or mark the file of a surface that is in RAS with SPACE=RAS."
@@ -28,29 +28,29 @@ _TURNED = (
 
 
 def place_landmarks(mesh: Mesh, points: Mapping[str, FloatArray], *, precision: float = 1e-12) -> SurfaceLandmarks:
-    """Place named points on a surface: each at the closest point of its triangles.
+    """Place named points at the closest points of the triangles of a surface.
 
-    Without triangles each is placed at the nearest vertex. Missing vertices (not-a-number) and their triangles are left
-    out.
+    Without triangles, each point is placed at the nearest vertex. Missing vertices (not-a-number) and their triangles
+    are ignored.
 
     Args:
         mesh: the surface, in mm.
-        points: name -> (3,) in the frame of `mesh`, mm.
-        precision: of the coordinates, as a share of the object's size (RMS); a point closer than this to a vertex or to
-            the surface is placed exactly there. The default is the rounding of float64.
+        points: name -> (3,) coordinates in the frame of `mesh`, mm.
+        precision: precision of the coordinates, as a share of the size of the object (RMS); a point closer than this to
+            a vertex or to the surface is placed exactly there. The default is the rounding of float64.
 
     Returns:
         The landmarks; their `distance_mm` are the distances of the points from the surface.
 
     Raises:
         InputError: a point that is not three finite numbers.
-        MeshError: no vertex of the surface is there.
+        MeshError: all vertices of the surface are missing.
     """
     if not points:
         return SurfaceLandmarks()
     for name, point in points.items():
         if np.shape(point) != (3,) or not np.isfinite(point).all():
-            raise InputError(f"Landmark {name!r} is not three finite numbers; correct it, or leave it out.")
+            raise InputError(f"Landmark {name!r} is not three finite numbers; correct or remove it.")
     places = np.stack([np.asarray(point, dtype=np.float64) for point in points.values()])
     there = np.asarray(np.isfinite(mesh.vertices).all(axis=1))
     if not there.any():
@@ -60,7 +60,7 @@ def place_landmarks(mesh: Mesh, points: Mapping[str, FloatArray], *, precision: 
         near = build_engine(Mesh(mesh.vertices[there], name=mesh.name)).query(places)
         vertices = np.flatnonzero(there)[near.vertex].tolist()
         return replace(SurfaceLandmarks.of(dict(zip(points, vertices, strict=True))), distance_mm=near.distance)
-    finite_vertices = np.where(there[:, None], mesh.vertices, 0.0)  # no triangle has those that are not there
+    finite_vertices = np.where(there[:, None], mesh.vertices, 0.0)  # no triangle uses the missing vertices
     near = build_engine(Mesh(finite_vertices, faces, name=mesh.name)).query(places)
     assert near.triangle is not None and near.barycentric is not None
     corners, weights = faces[near.triangle], np.clip(near.barycentric, 0.0, None)
@@ -76,14 +76,14 @@ def place_landmarks(mesh: Mesh, points: Mapping[str, FloatArray], *, precision: 
 def landmarks_in_frame_of(
     mesh: Mesh, points: Mapping[str, FloatArray]
 ) -> tuple[Mapping[str, FloatArray], tuple[str, ...]]:
-    """Return landmarks in the frame of a surface: turned by a half turn about z if only that takes them to it.
+    """Return landmarks in the frame of a surface: rotated by a half turn about z if they match the surface only then.
 
     Args:
         mesh: the surface, in any unit.
-        points: name -> (3,) in the same unit.
+        points: name -> (3,) coordinates in the same unit.
 
     Returns:
-        The landmarks, turned or as given, and a sentence if they were turned.
+        The landmarks, rotated or as given, and a sentence if they were rotated.
     """
     places = np.array(list(points.values()), dtype=np.float64)
     if not points or not np.isfinite(places).all() or not np.isfinite(mesh.vertices).any():
@@ -91,7 +91,7 @@ def landmarks_in_frame_of(
     both = np.concatenate([places, places * RAS_TO_LPS])
     placed = place_landmarks(mesh, {str(i): point for i, point in enumerate(both)})
     off = placed.distance_mm.reshape(2, -1) / rms_size(mesh.vertices[np.isfinite(mesh.vertices).all(axis=1)])
-    off = off[:, off.min(axis=0) <= STRAY]  # the others are not explained by a half turn
+    off = off[:, off.min(axis=0) <= STRAY]  # a half turn does not explain the others
     if 2 * off.shape[1] < len(places):
         return points, ()
     as_given, turned = np.sqrt((off**2).mean(axis=1))
@@ -101,9 +101,9 @@ def landmarks_in_frame_of(
 
 
 def far_landmarks(mesh: Mesh, landmarks: SurfaceLandmarks) -> list[str]:
-    """Return a sentence on landmarks that were given too far from the surface to belong to it, if there are any.
+    """Return a sentence on landmarks that are too far from the surface to belong to it, if any.
 
-    That is farther than the mean edge and than 1 % of the size of `mesh` (RMS distance from its centre).
+    These are farther than the mean edge and than 1 % of the size of `mesh` (RMS distance from its centre).
     """
     there = np.asarray(np.isfinite(mesh.vertices).all(axis=1))
     limit = _FAR_SHARE * rms_size(mesh.vertices[there])
@@ -113,9 +113,9 @@ def far_landmarks(mesh: Mesh, landmarks: SurfaceLandmarks) -> list[str]:
         limit = max(limit, float(np.nanmean(lengths)))
     distances = sorted(zip(landmarks.distance_mm.tolist(), landmarks.names, strict=True), reverse=True)
     far = [f"{name} ({distance:.2g})" for distance, name in distances if distance > limit]
-    some = "1 landmark is" if len(far) == 1 else f"{len(far)} landmarks are"
+    count = "1 landmark is" if len(far) == 1 else f"{len(far)} landmarks are"
     sentence = (
-        f"Warning: {some} farther from that surface than 1 % of its size and than its mean edge (distances in its "
+        f"Warning: {count} farther from that surface than 1 % of its size and than its mean edge (distances in its "
         f"unit): {first_names(far, _NAMED)}. Check the names, the unit and the frame of the landmarks."
     )
     return [sentence] if far else []

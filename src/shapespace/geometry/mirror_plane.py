@@ -1,6 +1,6 @@
-"""Mirror images in correspondence: the plane, which vertex is the other side's, and a surface turned about.
+"""Mirror images in correspondence: the mirror plane, pairs of vertices, and the mirror image of a surface.
 
-Which scans of a collection are mirror images of the others is decided for the collection as a whole (C30, C31). A few
+The decision which scans of a collection are mirror images of the others uses all scans together (C30, C31). A few
 scans are anchors. Each scan and its mirror image are compared with each anchor: raw scans by the scores of the pose
 search, shapes in correspondence by their Procrustes distances. The sides of anchors and scans that explain the scores
 best are those of the collection.
@@ -24,23 +24,23 @@ from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
 SYMMETRIC_SHARE = 0.02
 """A surface has mirror symmetry if the RMS distance to its mirror image is at most this share of its size."""
 FLIP = np.array([-1.0, 1.0, 1.0])
-"""What turns points (..., 3) into their mirror images about x = 0."""
+"""Factors of points (..., 3) that reflect them at the plane x = 0."""
 
-_POINTS = 1_000  # points of the mesh that planes are fitted to; time grows with them
+_POINTS = 1_000  # points of the mesh for the fit of planes; time is proportional to it
 _ITERATIONS = 30  # limit of the iterations for one plane
 _STOP = 1e-5
-"""The search for a plane ends at a step below this: of the normal in radians, of the offset as a share of the size."""
+"""The search for a plane ends at a step below this; normal in radians, offset as a share of the size."""
 _ALIKE = 0.3  # cosine of normals below which a point and its match are on different parts of the surface
 _SINGULAR = 1e-9  # share of the largest eigenvalue; directions below it, as of spheres, determine no plane
 _OTHER_PLANE = 0.7  # cosine; starts that end less than about 45 degrees apart have found the same plane
 _TRIES = 50
-"""Triangles from which pairs may fail to spread before the search is given up."""
+"""Number of first triangles without a result after which the search for pairs ends."""
 LARGEST_PAIR_SHARE = 0.2
-"""Points of a pair are no further from each other's mirror image than this share of the size."""
+"""Largest distance of a point from the mirror image of its partner, as a share of the size."""
 
 
 def mirror_image(mesh: Mesh) -> Mesh:
-    """Return the mirror image of a mesh at the plane x = 0, with triangles that are seen from the same side."""
+    """Return the mirror image of a mesh at the plane x = 0; triangles are flipped so that normals stay outward."""
     faces = None if mesh.faces is None else np.ascontiguousarray(mesh.faces[:, ::-1])
     landmarks = {name: point * FLIP for name, point in mesh.landmarks.items()}
     return replace(mesh, vertices=mesh.vertices * FLIP, faces=faces, landmarks=landmarks)
@@ -48,17 +48,17 @@ def mirror_image(mesh: Mesh) -> Mesh:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceMirror:
-    """A mirror plane in any pose, and for each vertex of a surface the place on it that is its mirror image.
+    """A mirror plane in any pose, and the mirror point of each vertex on a surface.
 
     Args:
-        corners: (V, 3) corners of the triangle on which the place is.
-        weights: (V, 3) barycentric coordinates of the place.
+        corners: (V, 3) corners of the triangle with the mirror point of each vertex.
+        weights: (V, 3) barycentric coordinates of the mirror points.
         normal: (3,) unit normal of the plane.
         offset: distance of the plane from the origin of the frame, along the normal.
-        off_share: RMS distance of the surface's mirror image from it, as a share of its size (RMS distance from its
-            centre). Points whose match is on the border or on a part that faces another way are missing on the other
-            side; the RMS of the rest is divided by its share of the points.
-        others_share: the same for other planes that were tried, the smallest first; empty if all starts lead to one
+        off_share: RMS distance of the mirror image of the surface from the surface, as a share of its size (RMS
+            distance from its centre). Points whose match is on the border or on a part with another orientation are
+            missing on the other side; the RMS of the other points is divided by their share of all points.
+        others_share: `off_share` of other planes that were tried, the smallest first; empty if all starts lead to one
             plane, or the pairs are known.
         image: (V, 3) the mirror image of the surface itself.
         pairs: (V,) partner of each vertex if the order of the triangles defines it (see `pairs_of_triangles`), else
@@ -76,7 +76,7 @@ class SurfaceMirror:
 
     @property
     def turn(self) -> FloatArray:
-        """(3, 3) the reflection of directions d (column vectors): turn d."""
+        """(3, 3) reflection matrix of directions (column vectors)."""
         return np.eye(3) - 2.0 * np.outer(self.normal, self.normal)
 
 
@@ -88,7 +88,7 @@ def find_mirror(mesh: Mesh) -> SurfaceMirror:
     triangles define pairs of vertices, the plane is that of the pairs.
 
     Args:
-        mesh: with triangles, in any frame.
+        mesh: mesh with triangles, in any frame.
     """
     x, faces = mesh.vertices, faces_of(mesh)
     centre, size, pairs = x.mean(axis=0), rms_size(x), pairs_of_triangles(faces, len(x))
@@ -116,9 +116,9 @@ def _best_plane(mesh: Mesh, engine: ClosestPointEngine, normal: FloatArray) -> t
     """Return `off_share` of the best plane near a first one, its normal and its offset.
 
     Args:
-        mesh: of size 1, about the origin.
-        engine: of it.
-        normal: (3,) of the first plane, which contains the origin.
+        mesh: mesh of size 1, centred at the origin.
+        engine: search structure of `mesh`.
+        normal: (3,) normal of the first plane, which contains the origin.
     """
     rows, offset, share, near = slice(None, None, max(1, len(mesh.vertices) // _POINTS)), 0.0, np.inf, None
     faces, rim, normals = faces_of(mesh), boundary_vertices(mesh), vertex_normals(mesh)
@@ -165,11 +165,12 @@ def pairs_of_triangles(faces: IntArray, vertices: int) -> IntArray | None:
     image. It remains in all surfaces in correspondence with them.
 
     Args:
-        faces: (F, 3).
-        vertices: how many there are.
+        faces: (F, 3) triangles.
+        vertices: number of vertices, V.
 
     Returns:
-        The pairs, their own inverse, vertices on the plane with themselves; None for triangles in another order.
+        The partners, a permutation that is its own inverse, in which vertices on the plane are their own partners; None
+        for triangles in another order.
     """
     half, own = len(faces) // 2, np.arange(vertices, dtype=np.int32)
     first, second, other = faces[:half], faces[half:], own.copy()
@@ -181,14 +182,14 @@ def pairs_of_triangles(faces: IntArray, vertices: int) -> IntArray | None:
 
 
 def mirror_pairs(mesh: Mesh, mirror: SurfaceMirror) -> IntArray | None:
-    """Return (V,) the vertex on the other side, its own inverse; None where vertices and triangles do not pair up.
+    """Return the partner (V,) of each vertex on the other side; None if vertices and triangles do not form pairs.
 
-    Vertices that are each nearest to the other's image begin, and triangles lead on: of two neighbouring triangles the
-    images are neighbours too. So pairs are found where the surface itself is not quite symmetric.
+    The search begins at vertices that are nearest to the images of each other, and continues along triangles, since the
+    images of neighbouring triangles are neighbours too. This finds pairs also if the surface is only nearly symmetric.
 
     Args:
         mesh: a surface with triangles.
-        mirror: of it.
+        mirror: mirror plane of `mesh`.
     """
     if mirror.pairs is not None:
         return mirror.pairs
@@ -196,14 +197,14 @@ def mirror_pairs(mesh: Mesh, mirror: SurfaceMirror) -> IntArray | None:
     nearest = np.asarray(cKDTree(x).query(mirror.image)[1], dtype=np.int32)
     if (nearest[nearest] == np.arange(len(x))).all():
         return nearest
-    other = _by_triangles(x, mirror.image, faces, nearest)
+    other = _find_pairs(x, mirror.image, faces, nearest)
     if other is None:
         return None
     far = np.linalg.norm(x[other] - mirror.image, axis=1).max()
     return other if far <= LARGEST_PAIR_SHARE * rms_size(x) else None
 
 
-def _by_triangles(x: FloatArray, image: FloatArray, faces: IntArray, nearest: IntArray) -> IntArray | None:
+def _find_pairs(x: FloatArray, image: FloatArray, faces: IntArray, nearest: IntArray) -> IntArray | None:
     across = {
         (int(face[k]), int(face[(k + 1) % 3])): int(face[(k + 2) % 3]) for face in faces for k in range(3)
     }  # fmt: skip
@@ -217,7 +218,7 @@ def _by_triangles(x: FloatArray, image: FloatArray, faces: IntArray, nearest: In
             break
         if (other[faces[triangle]] >= 0).all():
             continue
-        grown = _grown(faces[triangle].tolist(), nearest, across)
+        grown = _spread_pairs(faces[triangle].tolist(), nearest, across)
         if grown is not None:
             other[list(grown)] = list(grown.values())
         elif (tries := tries + 1) > _TRIES:
@@ -227,8 +228,8 @@ def _by_triangles(x: FloatArray, image: FloatArray, faces: IntArray, nearest: In
     return other if (other[other] == np.arange(count)).all() else None
 
 
-def _grown(seed: list[int], nearest: IntArray, across: Mapping[tuple[int, int], int]) -> dict[int, int] | None:
-    """Return the image of each vertex that triangles lead to from a triangle, None where two ways disagree."""
+def _spread_pairs(seed: list[int], nearest: IntArray, across: Mapping[tuple[int, int], int]) -> dict[int, int] | None:
+    """Return the images of all vertices that are connected by triangles to a first one; None if two paths disagree."""
     there = [int(nearest[v]) for v in seed]
     if across.get((there[1], there[0])) != there[2]:
         return None
@@ -236,7 +237,7 @@ def _grown(seed: list[int], nearest: IntArray, across: Mapping[tuple[int, int], 
     edges = deque((seed[k], seed[(k + 1) % 3]) for k in range(3))
     while edges:
         p, q = edges.popleft()
-        # The triangle beyond an edge runs along it the other way, and its image the other way again.
+        # The neighbouring triangle passes an edge in the opposite direction, and its image in the original direction.
         beyond, image = across.get((q, p)), across.get((pairs[p], pairs[q]))
         if (beyond is None) != (image is None):
             return None
@@ -251,29 +252,29 @@ def _grown(seed: list[int], nearest: IntArray, across: Mapping[tuple[int, int], 
 
 
 _LARGEST_EVIDENCE = 0.3
-"""Log ratio of scores beyond which a comparison counts no more: among 39 molars that were alike it was at most 0.2."""
+"""Limit of the log ratio of scores of a comparison: it was at most 0.2 among 39 similar molars."""
 _DRAWS, _P_VALUE = 1000, 0.01
-"""Draws of random signs, and the share of them that may agree as well: beyond it the object is taken as symmetric."""
+"""Number of draws of random signs, and the largest share of draws with equal agreement for an asymmetric object."""
 ASYMMETRIC = 0.08
-"""Median log ratio of scores up to which an object is taken as symmetric: it was at most 0.06 for faces, whose missing
+"""Median log ratio of scores up to which an object counts as symmetric: it was at most 0.06 for faces, whose missing
 parts and expressions can agree on wrong sides, 0.07 for spleens, 0.12 or more for molars, and 0.19 or more for femora
 and 11 simulated kinds."""
 _ALONE = np.log(0.85)
-"""Log ratio of scores of a scan and its mirror image below which one comparison decides: of 60 faces, femora and
-spleens that were not mirrored none had less than log 0.88."""
+"""Log ratio of scores of a scan and its mirror image below which a single comparison decides: it was at least log 0.88
+for 60 faces, femora and spleens that were not mirrored."""
 _ANCHORS = 3
-"""Shapes in correspondence that all others are compared with, as many as of raw scans."""
+"""Number of anchors among shapes in correspondence, as for raw scans."""
 _ROUNDING = 1e-12  # squared Procrustes distance, as a share of the squared size, of equal shapes
 _NAMED = 3  # names in a message
 
 
 @dataclass(frozen=True, eq=False)
 class Sides:
-    """The sides of the scans of a collection.
+    """Chirality of the scans of a collection.
 
     Args:
-        mirrored: (N,) which scans are mirror images of the majority.
-        margin: (N,) mean log ratio of scores by which the side was decided; 0 where nothing was compared.
+        mirrored: (N,) mask of the scans that are mirror images of the majority.
+        margin: (N,) mean log ratio of scores of the decision; 0 for scans without a comparison.
         decided: whether the scores of different anchors agree; False for a symmetric object or too few comparisons.
         asymmetry: median absolute log ratio of scores.
     """
@@ -288,10 +289,10 @@ def solve_sides(scores: FloatArray, anchors: Sequence[int], seed: int) -> Sides:
     """Return the sides that agree best with the scores of all comparisons.
 
     Args:
-        scores: (A, N, 2) of each scan and of its mirror image, compared with each anchor; not-a-number where they were
-            not compared.
-        anchors: (A,) their numbers among the scans; -1 for one that is none of them.
-        seed: of the draws for the test of agreement.
+        scores: (A, N, 2) scores of each scan and of its mirror image, compared with each anchor; not-a-number for pairs
+            that were not compared.
+        anchors: (A,) indices of the anchors among the scans; -1 for an anchor that is not a scan of the collection.
+        seed: seed of the random draws for the test of agreement.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         evidence = np.log(scores[:, :, 1]) - np.log(scores[:, :, 0])  # C30
@@ -318,15 +319,15 @@ def mirrored_note(shape: Callable[[int], FloatArray], name: Callable[[int], str]
     """Return a sentence that names the shapes in correspondence that are mirror images of the majority, if any.
 
     Args:
-        shape: returns the vertices (V, 3) of a shape by its index, in any pose and unit.
-        name: returns the name of a shape by its index.
+        shape: function that returns the vertices (V, 3) of a shape by its index, in any pose and unit.
+        name: function that returns the name of a shape by its index.
         count: number of shapes.
     """
     anchors = np.unique(np.linspace(0, count - 1, min(count, _ANCHORS)).round().astype(np.int32)).tolist()
-    references = [_normalised(shape(i)) for i in anchors]
+    references = [_normalise(shape(i)) for i in anchors]
     scores = np.empty((len(anchors), count, 2))
     for j in range(count):
-        vertices = _normalised(shape(j))
+        vertices = _normalise(shape(j))
         for a, reference in enumerate(references):
             u, s, vt = np.linalg.svd(reference.T @ vertices)
             last = s[2] if np.linalg.det(u @ vt) > 0 else -s[2]
@@ -343,14 +344,14 @@ def mirrored_note(shape: Callable[[int], FloatArray], name: Callable[[int], str]
     return [f"{mirrored.sum()} of {count} {of} of the others ({flagged}); reflect or remove them."]
 
 
-def _normalised(vertices: FloatArray) -> FloatArray:
+def _normalise(vertices: FloatArray) -> FloatArray:
     """Return vertices (V, 3) about their centroid, with centroid size 1."""
     centred = vertices - vertices.mean(axis=0)
     return centred / np.linalg.norm(centred)
 
 
 def _best_signs(evidence: FloatArray, anchors: Sequence[int]) -> tuple[FloatArray, float]:
-    """Return the signs (A,) of the anchors, the first +1, that leave most evidence undisputed, and its amount."""
+    """Return the signs (A,) of the anchors, the first +1, with most consistent evidence, and its amount."""
     patterns = np.array([(1.0, *signs) for signs in product((1.0, -1.0), repeat=len(evidence) - 1)])
     total = patterns @ evidence
     undisputed = np.abs(total)

@@ -1,4 +1,4 @@
-"""Areas, normals, boundary, samples and cotangent Laplacian of a surface, from its vertices and triangles alone."""
+"""Areas, normals, boundary, samples and cotangent Laplacian of a surface, from its vertices and triangles."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ def faces_of(mesh: Mesh) -> IntArray:
     """
     if mesh.faces is None:
         raise MeshError(
-            f"{mesh.name} has no faces, and triangles are needed here; make a mesh of its points, as by MeshLab."
+            f"{mesh.name} has no faces, and triangles are needed; make a mesh of its points, for example with MeshLab."
         )
     return mesh.faces
 
 
 def without_vertices(vertices: FloatArray, faces: IntArray, keep: BoolArray) -> tuple[FloatArray, IntArray]:
-    """Return the vertices `keep` (V,) of (V, 3) and, in their numbers, the triangles of (F, 3) between them."""
+    """Return the vertices `keep` (V,) of (V, 3) and the triangles of (F, 3) between them, renumbered."""
     number = np.cumsum(keep, dtype=np.int32) - 1
     return vertices[keep], number[faces[keep[faces].all(axis=1)]]
 
 
 def part_of(mesh: Mesh, keep: BoolArray) -> Mesh:
-    """Return a mesh or cloud with its vertices `keep` (V,) and the triangles between them; all else is unchanged."""
+    """Return a mesh or cloud with its vertices `keep` (V,) and the triangles between them; other data are unchanged."""
     faces = mesh.faces
     if faces is None:
         vertices = mesh.vertices[keep]
@@ -46,7 +46,7 @@ def part_of(mesh: Mesh, keep: BoolArray) -> Mesh:
 
 
 def without_estimates(mesh: Mesh) -> Mesh:
-    """Return `mesh` with not-a-number at the vertices that are not observed, and no mask."""
+    """Return `mesh` with not-a-number at the vertices that are not observed, and without a mask."""
     if mesh.observed is None:
         return mesh
     vertices = np.where(mesh.observed[:, None], mesh.vertices, np.nan)
@@ -59,7 +59,7 @@ def rms_size(points: FloatArray) -> float:
 
 
 def face_vectors(vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """Return (F, 3) cross products: normals of the triangles, as long as twice their areas."""
+    """Return cross products (F, 3): normals of the triangles, with twice the area as length."""
     a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
     return np.cross(b - a, c - a)
 
@@ -70,7 +70,7 @@ def face_areas(mesh: Mesh) -> FloatArray:
 
 
 def vertex_normals(mesh: Mesh) -> FloatArray:
-    """Return unit normals at the vertices, (V, 3), area-weighted; zero where no triangle gives one."""
+    """Return unit normals at the vertices, (V, 3), area-weighted; zero at vertices without a triangle."""
     faces = faces_of(mesh)
     vectors = face_vectors(mesh.vertices, faces)
     flat = faces.ravel()
@@ -108,9 +108,9 @@ def boundary_vertices(mesh: Mesh) -> BoolArray:
 
 
 WELL_SHAPED = 0.05
-"""Vertices own at least this share of the median area: slivers would be infinitely stiff."""
+"""Smallest area of a vertex, as a share of the median area: slivers would be infinitely stiff."""
 COTANGENTS = (0.02, 50.0)
-"""Obtuse triangles have negative weights, and slivers huge ones; they are kept within these."""
+"""Limits of the weights: obtuse triangles have negative weights, and slivers very large ones."""
 
 
 def cotangent_laplacian(mesh: Mesh) -> tuple[Any, FloatArray]:
@@ -130,7 +130,7 @@ def cotangent_laplacian(mesh: Mesh) -> tuple[Any, FloatArray]:
 
 
 def owned_areas(mesh: Mesh) -> FloatArray:
-    """Return the area (V,) of each vertex, which for slivers is taken for larger than it is."""
+    """Return the area (V,) of each vertex, with a lower limit for slivers."""
     area = vertex_areas(mesh)
     return np.maximum(area, WELL_SHAPED * np.median(area[np.unique(faces_of(mesh))]))
 
@@ -146,12 +146,12 @@ def half_cotangents(
 
 @dataclass(frozen=True, eq=False)
 class Distortion:
-    """A surface beside another one with the same triangles.
+    """Distortion of a surface relative to a reference surface with the same triangles.
 
     Args:
-        folded: (F,) which triangles turn back against those around them, and do not on the other surface.
-        growth: (F,) natural logarithm of the area beside that on the other surface, 0 in the middle (median);
-            not-a-number where either has no area.
+        folded: (F,) mask of the triangles whose normal opposes those around them, unlike on the reference surface.
+        growth: (F,) natural logarithm of the ratio of the area to that on the reference surface, less its median;
+            not-a-number if either area is 0.
     """
 
     folded: BoolArray
@@ -159,7 +159,7 @@ class Distortion:
 
     @staticmethod
     def of(surface: Mesh, rest: Mesh) -> Distortion:
-        """Return what became of the triangles of `rest` on `surface`, whose missing vertices are not-a-number.
+        """Return the distortion of the triangles of `rest` on `surface`, whose missing vertices are not-a-number.
 
         Raises:
             MeshError: there are no triangles.
@@ -173,25 +173,25 @@ class Distortion:
         if known.any():
             growth -= np.median(growth[known])
         vertices = len(surface.vertices)
-        return Distortion(_turned_back(now, faces, vertices) & ~_turned_back(before, faces, vertices), growth)
+        return Distortion(_find_opposing(now, faces, vertices) & ~_find_opposing(before, faces, vertices), growth)
 
     @property
     def folded_share(self) -> float:
-        """Share of the triangles that are there which fold over; 0 where none is there."""
+        """Share of folded triangles among those that are not missing; 0 if all are missing."""
         known = np.isfinite(self.growth)
         return float(self.folded[known].mean()) if known.any() else 0.0
 
     @property
     def area_factor(self) -> float:
-        """The factor by which 95 % of the triangles grow or shrink at most, the change of size divided out."""
+        """Largest factor of growth or shrinkage of 95 % of the triangles, without the change of size."""
         known = self.growth[np.isfinite(self.growth)]
         return float(np.exp(np.quantile(np.abs(known), 0.95))) if len(known) else float("nan")
 
 
 def edge_stretch(vertices: FloatArray, rest: Mesh) -> float:
-    """Return the RMS log ratio of the edges of a surface `vertices` (V, 3) and of `rest`, the change of size removed.
+    """Return the RMS log ratio of the edges of a surface `vertices` (V, 3) and of `rest`, without the change of size.
 
-    It is 0 where the surface is only bent. Edges without length in either are left out.
+    It is 0 if the surface is only bent. Edges whose length is 0 on either surface are ignored.
     """
     faces = faces_of(rest)
     first, second = faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel()
@@ -202,8 +202,8 @@ def edge_stretch(vertices: FloatArray, rest: Mesh) -> float:
     return float(np.sqrt(np.mean((logs - np.median(logs)) ** 2))) if len(logs) else 0.0
 
 
-def _turned_back(vectors: FloatArray, faces: IntArray, vertices: int) -> BoolArray:
-    """Return (F,) whether a triangle's normal points against the mean normal of all that touch it."""
+def _find_opposing(vectors: FloatArray, faces: IntArray, vertices: int) -> BoolArray:
+    """Return (F,) whether the normal of a triangle opposes the mean normal of all triangles that touch it."""
     there = np.where(np.isfinite(vectors), vectors, 0.0)
     flat = faces.ravel()
     sums = np.stack([np.bincount(flat, np.repeat(there[:, k], 3), vertices) for k in range(3)], axis=1)
@@ -218,9 +218,9 @@ def flip_factor(vertices: FloatArray, change: FloatArray, faces: IntArray) -> fl
     is quadratic in the factor, so the first root has a closed form.
 
     Args:
-        vertices: (V, 3) of the surface that is changed.
-        change: (V, 3) displacement of each vertex at the factor 1.
-        faces: (F, 3).
+        vertices: (V, 3) positions of the surface before the change.
+        change: (V, 3) displacement of each vertex for the factor 1.
+        faces: (F, 3) triangles.
     """
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     u, v, w = (change[faces[:, k]] for k in range(3))
@@ -232,7 +232,7 @@ def flip_factor(vertices: FloatArray, change: FloatArray, faces: IntArray) -> fl
     q0, q1, q2 = q0[known], q1[known], q2[known]
     inside = q1**2 - 4.0 * q2 * q0
     real = inside >= 0
-    # The larger of the two sums in size, so that nothing cancels; its inverse gives the other root.
+    # The sum with the larger absolute value avoids cancellation; its inverse gives the other root.
     half = -0.5 * (q1[real] + np.copysign(np.sqrt(inside[real]), q1[real]))
     with np.errstate(divide="ignore", invalid="ignore"):
         roots = np.concatenate([half / q2[real], q0[real] / half])
@@ -244,8 +244,8 @@ def factor_to_draw(wanted: float, flips_at: float) -> float:
     """Return the largest of 1, 2, 3, 5, 10, 20, ... and 0.5, 0.3, 0.2, 0.1, ... up to `wanted` and below `flips_at`.
 
     Args:
-        wanted: the factor by which a change would be drawn, positive.
-        flips_at: the factor at which the first triangle flips, from `flip_factor`.
+        wanted: preferred factor of the change in a figure, positive.
+        flips_at: factor at which the first triangle flips, from `flip_factor`.
     """
     steps = sorted(step * 10.0**power for power in range(-6, 4) for step in (1, 2, 3, 5))
     return max((step for step in steps if step <= wanted * (1 + 1e-9) and step < flips_at), default=steps[0])

@@ -1,7 +1,7 @@
 """The outer surface of a scan: its triangles that are visible from outside, by depth maps from many directions.
 
-Surfaces of CT scans also contain marrow cavities, trabeculae and canals. They need not be pieces of their own, so what
-counts is the exposure of a triangle: the share of all directions from which it is visible.
+Surfaces of CT scans also contain marrow cavities, trabeculae and canals, which may be connected to the outer surface.
+The criterion is therefore the exposure of a triangle: the share of all directions from which it is visible.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
 
 _AXES, _PIXELS = 64, 768
 """Axes along which depth maps are made, each seen from both ends, and their width: 0.3 mm of 200 mm."""
-_FEW_AXES, _FEW_PIXELS = 16, 256  # the same for the decision whether there are inner surfaces at all
+_FEW_AXES, _FEW_PIXELS = 16, 256  # for the decision whether there are inner surfaces
 _EXPOSED = 0.05
 """Exposure of outer triangles: a convex surface has 0.4, the bottom of an orbit about 0.1, and the wall of a canal at a
 depth of two radii 0.045."""
-_GRAZING = 0.2  # cosine to the direction below which a triangle is not judged: its depth is uncertain
+_GRAZING = 0.2  # cosine to the direction below which a triangle is not tested, since its depth is uncertain
 _CREASE = 0.002
-"""Hidden patches on an outer surface with less than this share of all area are creases, and stay."""
+"""Hidden patches on an outer surface with less than this share of the total area are creases, and are kept."""
 _SPECK = 0.01
 """Visible patches amid hidden triangles with less than this share of the outer area are seen through an opening."""
 
 
 def outer_surface(mesh: Mesh) -> Mesh:
-    """Return `mesh` without the triangles that are hardly visible from outside; a point cloud stays as it is."""
+    """Return `mesh` without the triangles that are hardly visible from outside; a point cloud is returned unchanged."""
     if mesh.faces is None or not len(mesh.faces):
         return mesh
     is_outer = _without_specks(mesh, _exposure(mesh, _AXES, _PIXELS) >= _EXPOSED)
@@ -43,7 +43,7 @@ def outer_surface(mesh: Mesh) -> Mesh:
 
 
 def hidden_share(mesh: Mesh) -> float:
-    """Return the share of the area of `mesh` that is hardly visible from outside, coarsely; 0 for a point cloud."""
+    """Estimate the share of the area of `mesh` that is hardly visible from outside; 0 for a point cloud."""
     if mesh.faces is None or not len(mesh.faces):
         return 0.0
     area = np.nan_to_num(_areas(mesh.vertices, mesh.faces))
@@ -55,7 +55,7 @@ def _areas(vertices: FloatArray, faces: IntArray) -> FloatArray:
 
 
 def _exposure(mesh: Mesh, axes: int, pixels: int) -> FloatArray:
-    """Return (F,) the exposure of each triangle; 1 for those with coordinates that are not finite."""
+    """Return the exposure (F,) of each triangle; 1 for triangles with coordinates that are not finite."""
     faces = faces_of(mesh)
     is_finite = np.asarray(np.isfinite(mesh.vertices[faces]).all(axis=(1, 2)))
     exposure = np.ones(len(faces))
@@ -74,7 +74,7 @@ def _exposure(mesh: Mesh, axes: int, pixels: int) -> FloatArray:
 
 
 def _frames(count: int) -> FloatArray:
-    """Return (N, 3, 3) rotations whose last axes are spread evenly over a half of the sphere."""
+    """Return rotations (N, 3, 3) whose last axes are evenly distributed over a half of the sphere."""
     k = np.arange(count) + 0.5
     height, angle = 1.0 - k / count, np.pi * (1.0 + 5.0**0.5) * k
     radius = np.sqrt(1.0 - height**2)
@@ -85,12 +85,12 @@ def _frames(count: int) -> FloatArray:
 
 @compiled
 def _count_visible(x: FloatArray, faces: IntArray, area: FloatArray, pixels: int, seen: IntArray) -> None:
-    """Add to `seen` (F,) from how many ends of the third axis each triangle is visible, its centroid that is.
+    """Add to `seen` (F,) the number of ends of the third axis from which the centroid of each triangle is visible.
 
     Args:
-        x: (V, 3) vertices in pixels, the third coordinate along the view.
-        faces: (F, 3).
-        area: (F,) of the triangles, square pixels.
+        x: (V, 3) vertices in pixels, with the third coordinate along the view.
+        faces: (F, 3) triangles.
+        area: (F,) areas of the triangles, square pixels.
         pixels: width of the depth maps.
         seen: (F,) counts, changed in place.
     """
@@ -115,7 +115,7 @@ def _count_visible(x: FloatArray, faces: IntArray, area: FloatArray, pixels: int
         if abs(double) < 2.0 * _GRAZING * area[f] or double == 0.0:
             continue
         i, j = int((a[0] + b[0] + c[0]) / 3.0), int((a[1] + b[1] + c[1]) / 3.0)
-        # The depth of its plane at the centre of the pixel.
+        # The depth of the plane of the triangle at the centre of the pixel.
         u = ((b[0] - i - 0.5) * (c[1] - j - 0.5) - (b[1] - j - 0.5) * (c[0] - i - 0.5)) / double
         v = ((c[0] - i - 0.5) * (a[1] - j - 0.5) - (c[1] - j - 0.5) * (a[0] - i - 0.5)) / double
         depth = u * a[2] + v * b[2] + (1.0 - u - v) * c[2]
@@ -124,7 +124,7 @@ def _count_visible(x: FloatArray, faces: IntArray, area: FloatArray, pixels: int
 
 
 def _without_specks(mesh: Mesh, is_outer: BoolArray) -> BoolArray:
-    """Return which triangles are outer: small creases are, and small patches seen through an opening are not."""
+    """Return the mask of outer triangles, with small creases and without small patches seen through an opening."""
     vertices, faces = mesh.vertices, faces_of(mesh)
     area = np.nan_to_num(_areas(vertices, faces))
     pairs = _neighbours(vertices, faces)
@@ -137,7 +137,7 @@ def _without_specks(mesh: Mesh, is_outer: BoolArray) -> BoolArray:
 
 
 def _neighbours(vertices: FloatArray, faces: IntArray) -> LongArray:
-    """Return (M, 2) triangles that share an edge, by the places of its ends."""
+    """Return pairs (M, 2) of triangles that share an edge, by the positions of its ends."""
     place = np.unique(vertices, axis=0, return_inverse=True)[1].reshape(-1)[faces].astype(np.int64)
     ends = np.sort(np.stack([place, place[:, [1, 2, 0]]], axis=2), axis=2).reshape(-1, 2)
     key = ends[:, 0] * (place.max() + 1) + ends[:, 1]
@@ -147,7 +147,7 @@ def _neighbours(vertices: FloatArray, faces: IntArray) -> LongArray:
 
 
 def _patches(is_outer: BoolArray, pairs: LongArray) -> tuple[IntArray, BoolArray]:
-    """Return (F,) the connected patch of triangles alike, and for each patch whether it borders on another one."""
+    """Return the patch (F,) of connected outer or hidden triangles, and whether each patch borders on another one."""
     alike = is_outer[pairs[:, 0]] == is_outer[pairs[:, 1]]
     ends, count = pairs[alike], len(is_outer)
     graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))

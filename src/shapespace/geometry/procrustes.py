@@ -1,4 +1,4 @@
-"""Generalised Procrustes: bring corresponding shapes into one pose, in a stated gauge.
+"""Generalised Procrustes analysis: alignment of corresponding shapes to a common pose, with or without scale.
 
 Gower, Psychometrika 40(1), 1975; Goodall, JRSS B 53(2), 1991. Equations Cn are those of docs/correspondence.md and
 docs/missing.md.
@@ -16,13 +16,13 @@ from shapespace.errors import InputError
 from shapespace.geometry.similarity import fit_rotations, fit_similarity
 from shapespace.types import FloatArray, IntArray, Similarity
 
-# limit of iterations to the tangent space, and the relative change that ends them, near float64 rounding
+# limit of iterations to the tangent space, and relative change that ends these, near float64 rounding
 _TANGENT_ROUNDS, _IN_TANGENT = 20, 1e-13
-# relative change of the mean that ends the alignment, and the limit of its iterations
+# relative change of the mean that ends the alignment, and limit of its iterations
 _TOLERANCE, _MOST_ROUNDS = 1e-10, 100
 _WEIGHTED_ROUNDS = 6  # iterations of a weighted alignment, which starts from the unweighted one
 _LEAST_WEIGHT = 1e-3
-"""So that a vertex that no shape observes has a mean."""
+"""Smallest weight, so that vertices that no shape observes have a mean."""
 
 Gauge: TypeAlias = Literal["form", "shape"]
 """`form`: rigid alignment, size stays in the modes. `shape`: alignment with scale, size is divided out."""
@@ -30,12 +30,12 @@ Gauge: TypeAlias = Literal["form", "shape"]
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """The outcome of generalised Procrustes.
+    """Result of generalised Procrustes analysis.
 
     Args:
         mean: (V, 3) mean shape, mm.
-        iterations: rounds until the mean stood still.
-        converged: False when the cap came first.
+        iterations: number of iterations.
+        converged: whether the mean converged; False if the limit of iterations was reached before.
     """
 
     mean: FloatArray
@@ -59,27 +59,27 @@ def align_in_place(
 ) -> Alignment:
     """Align `shapes` (N, V, 3) to their common mean, overwriting them, and return that mean.
 
-    The frame is the first shape's orientation, the origin is the mean's centroid, and in the `shape` gauge every
-    shape is scaled to the mean centroid size of the shapes as given, so that the modes stay in mm.
+    The axes are those of the first shape, the origin is the centroid of the mean, and with the gauge `shape` every
+    shape is scaled to the mean centroid size of the input shapes, so that the modes are in mm.
 
     Args:
         shapes: (N, V, 3) float64, writable, mm.
-        gauge: `form` or `shape`.
-        alignment_vertices: indices of the vertices that carry the alignment (the semi-rigid ones for models of
+        gauge: size handling, `form` (rigid) or `shape` (with scale).
+        alignment_vertices: indices of the vertices used for the alignment (the semi-rigid vertices for models of
             expressions); None for all.
-        tolerance: stop when the mean moves less than this share of its size (RMS).
-        max_iterations: cap.
-        on_iteration: called with the round and the movement of the mean in mm.
+        tolerance: movement of the mean that ends the iterations, as a share of its size (RMS).
+        max_iterations: limit of the iterations.
+        on_iteration: function that is called with the iteration and the movement of the mean, mm.
 
     Raises:
-        InputError: unknown gauge, fewer than three vertices to align by, or some that do not exist.
+        InputError: the gauge is unknown, or the vertices for the alignment are fewer than three or do not exist.
     """
     chosen = check_alignment(gauge, alignment_vertices, shapes.shape[1])
     with_scale = gauge == "shape"
     sizes = [centroid_size(shape[chosen]) for shape in shapes]
     size = float(np.mean(sizes))
     if min(sizes) <= 0:
-        raise InputError("All vertices of a training shape coincide, so it cannot be aligned; leave it out.")
+        raise InputError("All vertices of a training shape coincide, so it cannot be aligned; exclude it.")
 
     reference = mean = _start(shapes[0], chosen, size, with_scale)
     for iteration in range(1, max_iterations + 1):
@@ -93,7 +93,7 @@ def align_in_place(
                 T_mean_shape = Similarity(scale, rotation, -scale * rotation @ centre)  # C18
             shapes[index] = T_mean_shape.apply(shapes[index])
             mean += shapes[index]
-        mean = _in_frame(mean / len(shapes), reference, chosen, size, with_scale)  # C19
+        mean = _move_to_frame(mean / len(shapes), reference, chosen, size, with_scale)  # C19
         moved = float(np.sqrt(((mean - previous) ** 2).sum(axis=1).mean()))
         if on_iteration is not None:
             on_iteration(iteration, moved)
@@ -107,7 +107,7 @@ def align_in_place(
 def align_shapes(shapes: FloatArray, gauge: Gauge, alignment_vertices: IntArray | None = None) -> FloatArray:
     """Align training `shapes` (N, V, 3) in place, as `align_in_place` and `scale_to_tangent` do, and return them."""
     align_in_place(shapes, gauge, alignment_vertices=alignment_vertices)
-    # Where only some vertices carried the alignment, the size of the others is shape.
+    # If only some vertices are used for the alignment, the size of the others belongs to the shape.
     if gauge == "shape" and alignment_vertices is None:
         scale_to_tangent(shapes)
     return shapes
@@ -119,9 +119,9 @@ def align_to_weighted_mean(shapes: FloatArray, weights: FloatArray, frame: Float
     Unlike in `align_in_place`, each size is fitted, and vertices may be missing.
 
     Args:
-        shapes: in any poses and sizes.
-        weights: (N, V) of the vertices, 0 to 1; poses are fitted to those above 0.
-        frame: (V, 3) the shape whose pose and size the mean has.
+        shapes: (N, V, 3) shapes in any poses and sizes.
+        weights: (N, V) weights of the vertices, 0 to 1; poses are fitted to vertices with positive weight.
+        frame: (V, 3) shape that determines the pose and size of the mean.
     """
     mean, aligned = frame, shapes
     floored = np.maximum(weights, _LEAST_WEIGHT)[:, :, None]
@@ -134,21 +134,21 @@ def align_to_weighted_mean(shapes: FloatArray, weights: FloatArray, frame: Float
 
 
 def check_alignment(gauge: Gauge, alignment_vertices: IntArray | None, n_vertices: int) -> IntArray | slice:
-    """Return the index of the vertices that carry the alignment, of `n_vertices`.
+    """Return the index of the vertices for the alignment, of `n_vertices`.
 
     Raises:
-        InputError: unknown gauge, fewer than three vertices to align by, or some that do not exist.
+        InputError: the gauge is unknown, or the vertices for the alignment are fewer than three or do not exist.
     """
     if gauge not in ("form", "shape"):
         raise InputError(f"There is no gauge {gauge!r}; choose form (rigid) or shape (with scale).")
     if alignment_vertices is None:
         return slice(None)
     if len(alignment_vertices) < 3:
-        raise InputError("Alignment needs at least three vertices; give more of them, or none to use all.")
+        raise InputError("Alignment needs at least three vertices; give more vertices, or none to use all.")
     if not 0 <= np.min(alignment_vertices) <= np.max(alignment_vertices) < n_vertices:
         raise InputError(
-            f"The vertices that carry the alignment are counted from 0 to {n_vertices - 1}, but one of those "
-            "given lies outside; check them."
+            f"The vertices for the alignment are counted from 0 to {n_vertices - 1}, but a given index is "
+            "outside this range; correct it."
         )
     return alignment_vertices
 
@@ -158,7 +158,7 @@ def _start(first: FloatArray, chosen: IntArray | slice, size: float, with_scale:
     return mean * (size / centroid_size(mean[chosen])) if with_scale else mean
 
 
-def _in_frame(
+def _move_to_frame(
     mean: FloatArray, reference: FloatArray, chosen: IntArray | slice, size: float, with_scale: bool
 ) -> FloatArray:
     if with_scale:
@@ -167,11 +167,11 @@ def _in_frame(
 
 
 def scale_to_tangent(shapes: FloatArray) -> None:
-    """Scale each of the aligned `shapes` (N, V, 3) in place so that none varies along the mean.
+    """Scale each of the aligned `shapes` (N, V, 3) in place to the tangent plane at their mean.
 
-    Shapes of one size lie on a sphere, so to second order they vary along its radius, which is what a scaling does to
-    the mean. In the tangent plane at the mean they are the same shapes, and no mode can be separated from the scale of
-    a pose (Dryden and Mardia, Statistical Shape Analysis, 2016, section 4.4).
+    Shapes of equal size are on a sphere, so to second order they vary along its radius, as by a scaling of the mean. In
+    the tangent plane at the mean, the shapes are the same, and no mode contains the scale of a pose (Dryden and Mardia,
+    Statistical Shape Analysis, 2016, section 4.4).
     """
     flat = shapes.reshape(len(shapes), -1)
     mean = flat.mean(axis=0)
@@ -185,31 +185,31 @@ def scale_to_tangent(shapes: FloatArray) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """What brings each shape to the common mean: its vertices x (row vectors) go to x @ linear.T + offset.
+    """Poses of shapes relative to the common mean: vertices x (row vectors) are mapped to x @ linear.T + offset.
 
     Args:
         linear: (N, 3, 3) rotations times scales.
-        offset: (N, 3) mm.
+        offset: (N, 3) translations, mm.
     """
 
     linear: FloatArray
     offset: FloatArray
 
     def apply(self, start: int, shapes: FloatArray) -> FloatArray:
-        """Return `shapes` (n, V, 3), which are those from `start` on, in their poses."""
+        """Return `shapes` (n, V, 3), those with the indices from `start` on, in their poses."""
         part = slice(start, start + len(shapes))
         return shapes @ self.linear[part].transpose(0, 2, 1) + self.offset[part, None]
 
 
 @dataclass(frozen=True, eq=False)
 class Streamed:
-    """Shapes that are read again for each pass, as differences from one template, so that they need not be held.
+    """Shapes that are read again in each pass, as differences from a template, so that they are not kept in memory.
 
     Args:
-        blocks: gives (start, differences (n, 3V)) of all N shapes, in order, whenever it is called.
-        count: N.
-        template: (V, 3) mm.
-        sizes: (N,) centroid size, mm, of each shape's vertices that carry the alignment.
+        blocks: function that yields (start, differences (n, 3V)) of all N shapes, in order, at each call.
+        count: number of shapes, N.
+        template: (V, 3) vertices of the template, mm.
+        sizes: (N,) centroid size of the vertices of each shape that are used for the alignment, mm.
     """
 
     blocks: Callable[[], Iterable[tuple[int, FloatArray]]]
@@ -229,20 +229,20 @@ def align_streamed(
     max_iterations: int = _MOST_ROUNDS,
     on_iteration: Callable[[int, float], None] | None = None,
 ) -> tuple[Alignment, Poses]:
-    """Do what `align_in_place` does, one pass over `shapes` a round, and return the poses instead of the shapes.
+    """Align shapes as `align_in_place` in one pass over `shapes` per iteration, and return poses instead of shapes.
 
     Args:
-        shapes: N of them, in poses near to one another.
-        gauge: `form` or `shape`.
-        size: the mean centroid size of the shapes as given, mm.
-        reference: (V, 3) whose orientation is the frame: the first shape as given.
-        alignment_vertices: as of `align_in_place`.
-        tolerance: as of `align_in_place`.
-        max_iterations: cap.
-        on_iteration: called with the round and the movement of the mean in mm.
+        shapes: N shapes in similar poses.
+        gauge: size handling, `form` (rigid) or `shape` (with scale).
+        size: mean centroid size of the input shapes, mm.
+        reference: (V, 3) shape whose axes are used, the first input shape, mm.
+        alignment_vertices: indices of the vertices used for the alignment; None for all.
+        tolerance: movement of the mean that ends the iterations, as a share of its size (RMS).
+        max_iterations: limit of the iterations.
+        on_iteration: function that is called with the iteration and the movement of the mean, mm.
 
     Raises:
-        InputError: as `align_in_place`, or a shape that determines no rotation.
+        InputError: a shape determines no rotation, or see `align_in_place`.
     """
     chosen = check_alignment(gauge, alignment_vertices, len(shapes.template))
     with_scale = gauge == "shape"
@@ -257,14 +257,14 @@ def align_streamed(
         def turned(
             start: int, products: FloatArray, centres: FloatArray, centre: FloatArray = centre
         ) -> tuple[FloatArray, FloatArray]:
-            linear = fit_rotations(products, refuse_lines=True)
+            linear = fit_rotations(products, reject_lines=True)
             if with_scale:
                 linear *= (size / shapes.sizes[start : start + len(linear)])[:, None, None]
             moved = np.einsum("nab,nb->na", linear, centres)
             return linear, -moved if with_scale else centre - moved  # C18
 
-        unframed = _pass(shapes, target, chosen, poses, turned)
-        mean = _in_frame(unframed, reference, chosen, size, with_scale)  # C19
+        unframed = _run_pass(shapes, target, chosen, poses, turned)
+        mean = _move_to_frame(unframed, reference, chosen, size, with_scale)  # C19
         moved = float(np.sqrt(((mean - previous) ** 2).sum(axis=1).mean()))
         if on_iteration is not None:
             on_iteration(iteration, moved)
@@ -274,12 +274,12 @@ def align_streamed(
 
 
 def scale_to_tangent_streamed(shapes: Streamed, mean: FloatArray, poses: Poses) -> FloatArray:
-    """Do what `scale_to_tangent` does to shapes in `poses`, which are changed, and return their mean (V, 3).
+    """Scale shapes to the tangent plane as `scale_to_tangent`, by changing `poses`, and return their mean (V, 3).
 
     Args:
-        shapes: N of them.
-        mean: (V, 3) of them in their poses.
-        poses: as `align_streamed` returned them.
+        shapes: N shapes.
+        mean: (V, 3) mean of the shapes in `poses`, mm.
+        poses: poses from `align_streamed`; they are changed.
     """
     for _ in range(_TANGENT_ROUNDS):
         furthest = 0.0
@@ -299,29 +299,29 @@ def scale_to_tangent_streamed(shapes: Streamed, mean: FloatArray, poses: Poses) 
             furthest = max(furthest, float(np.abs(along - 1.0).max()))
             return linear / along[:, None, None], offset / along[:, None]  # C20
 
-        mean = _pass(shapes, target, slice(None), poses, scaled)
+        mean = _run_pass(shapes, target, slice(None), poses, scaled)
         if furthest < _IN_TANGENT:
             break
     return mean
 
 
-def _pass(
+def _run_pass(
     shapes: Streamed,
     target: FloatArray,
     chosen: IntArray | slice,
     poses: Poses,
     pose: Callable[[int, FloatArray, FloatArray], tuple[FloatArray, FloatArray]],
 ) -> FloatArray:
-    """Pose all shapes by their products with `target` (V, 3), and return the mean (V, 3) in these poses.
+    """Compute the poses of all shapes from their products with `target` (V, 3), and return their mean (V, 3).
 
-    All is linear in the shapes, so that a block takes two products of matrices.
+    All operations are linear in the shapes, so a block takes two matrix products.
 
     Args:
-        shapes: N of them.
-        target: (V, 3).
-        chosen: vertices of which centroids are taken.
-        poses: written to.
-        pose: (start, products x^T target (n, 3, 3), centroids (n, 3)) -> linear (n, 3, 3), offset (n, 3).
+        shapes: N shapes.
+        target: (V, 3) factor of the products.
+        chosen: indices of the vertices of the centroids.
+        poses: output for the poses.
+        pose: function (start, products x^T target (n, 3, 3), centroids (n, 3)) -> linear (n, 3, 3), offset (n, 3).
     """
     template, V = shapes.template, len(shapes.template)
     axes = np.eye(3)

@@ -1,7 +1,7 @@
 """Finer and coarser triangles on a surface.
 
-libigl is asked only what it answers without fault. Loop subdivision is one sparse matrix, so that a whole basis is
-refined by one product.
+Only functions of libigl without known defects are used. Loop subdivision is a sparse matrix, so that a complete basis
+is refined by one product.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ LongArray = npt.NDArray[np.int64]
 
 
 def is_sheet(faces: npt.NDArray[np.integer]) -> bool:
-    """Whether no edge of `faces` (F, 3) is passed twice in one direction, and none leads back to its own vertex.
+    """Return whether no edge of `faces` (F, 3) occurs twice in one direction or joins a vertex to itself.
 
-    So at most two triangles share an edge, they agree on the side that is outside, and each has three corners.
+    Then at most two triangles share an edge, their orientations agree, and each has three different corners.
     """
     ends = np.asarray(faces, dtype=np.int64)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     if not len(ends) or (ends[:, 0] == ends[:, 1]).any():
@@ -31,63 +31,63 @@ def is_sheet(faces: npt.NDArray[np.integer]) -> bool:
 
 
 def split(vertices: FloatArray, faces: npt.NDArray[np.integer], name: str) -> tuple[FloatArray, LongArray]:
-    """Return vertices and triangles of the surface with each of (F, 3) triangles parted into four at mid-edge.
+    """Return vertices and triangles of the surface with each of (F, 3) triangles split into four at the edge midpoints.
 
     Raises:
-        MeshError: `faces` are no sheet, as `is_sheet` has it; `name` says whose.
+        MeshError: `faces` are not a sheet, see `is_sheet`; the message contains `name`.
     """
-    asked = _asked(vertices, faces, name)
-    fine, triangles = _igl().upsample(*asked, 1)
+    prepared = _prepare(vertices, faces, name)
+    fine, triangles = _igl().upsample(*prepared, 1)
     return np.asarray(fine, dtype=np.float64), np.asarray(triangles, dtype=np.int64)
 
 
 def collapse(
     vertices: FloatArray, faces: npt.NDArray[np.integer], triangles: int, name: str
 ) -> tuple[FloatArray, LongArray, LongArray]:
-    """Return vertices (S, 3) and about `triangles`, the shortest edges collapsed, each to its middle.
+    """Return vertices (S, 3) and about `triangles` triangles, after collapsing the shortest edges to their midpoints.
 
-    Also returned is (S,) a vertex of the surface from which each is made. Where no edge can collapse without a fold,
-    more triangles are left.
+    The third result is (S,) an original vertex that was merged into each vertex. If no edge can collapse without a
+    fold, more triangles remain.
 
     Raises:
-        MeshError: `faces` are no sheet, as `is_sheet` has it, or borders of it touch; `name` says whose.
+        MeshError: `faces` are not a sheet, see `is_sheet`, or its borders touch; the message contains `name`.
     """
-    asked = _asked(vertices, faces, name)
-    coarse, left, _, origin = _igl().decimate(*asked, triangles)
+    prepared = _prepare(vertices, faces, name)
+    coarse, left, _, origin = _igl().decimate(*prepared, triangles)
     if not len(left):
         raise MeshError(
-            f"{name} cannot be re-triangulated, since borders of it touch; clean the mesh in MeshLab (Cleaning) first."
+            f"{name} cannot be re-triangulated, since its borders touch; clean the mesh in MeshLab (Cleaning) first."
         )
     return np.asarray(coarse, dtype=np.float64), np.asarray(left, dtype=np.int64), np.asarray(origin, dtype=np.int64)
 
 
 def parted(faces: npt.NDArray[np.integer]) -> tuple[LongArray, LongArray]:
-    """Return `faces` (F, 3) in numbers of new vertices, and (W,) which vertex each of those is.
+    """Return `faces` (F, 3) with new vertex numbers, and (W,) the original vertex of each new vertex.
 
-    Where more than two triangles share an edge, or parts of a surface touch at a vertex alone, each part has its own
-    vertices; nothing else changes.
+    If more than two triangles share an edge, or parts of a surface touch only at a vertex, each part has its own
+    vertices; other vertices are unchanged.
     """
     new, origin = _igl().split_nonmanifold(np.ascontiguousarray(faces, dtype=np.int64))
     return np.asarray(new, dtype=np.int64), np.asarray(origin, dtype=np.int64)
 
 
 def onto(points: FloatArray, vertices: FloatArray, faces: npt.NDArray[np.integer]) -> FloatArray:
-    """Return the points (M, 3) of a surface nearest to `points` (M, 3)."""
-    _, _, nearest = _igl().point_mesh_squared_distance(points, *_plain(vertices, faces))
+    """Return the points (M, 3) on a surface that are nearest to `points` (M, 3)."""
+    _, _, nearest = _igl().point_mesh_squared_distance(points, *_contiguous_arrays(vertices, faces))
     return np.asarray(nearest, dtype=np.float64)
 
 
-def _asked(vertices: FloatArray, faces: npt.NDArray[np.integer], name: str) -> tuple[FloatArray, LongArray]:
-    # libigl 2.6 writes beyond its tables where an edge is passed twice in one direction.
+def _prepare(vertices: FloatArray, faces: npt.NDArray[np.integer], name: str) -> tuple[FloatArray, LongArray]:
+    # libigl 2.6 writes beyond its arrays if an edge occurs twice in one direction.
     if not is_sheet(faces):
         raise MeshError(
             f"{name} cannot be re-triangulated: more than two triangles share an edge, or neighbours disagree on which "
             "side is outside; clean the mesh in MeshLab (Cleaning) first."
         )
-    return _plain(vertices, faces)
+    return _contiguous_arrays(vertices, faces)
 
 
-def _plain(vertices: FloatArray, faces: npt.NDArray[np.integer]) -> tuple[FloatArray, LongArray]:
+def _contiguous_arrays(vertices: FloatArray, faces: npt.NDArray[np.integer]) -> tuple[FloatArray, LongArray]:
     return np.ascontiguousarray(vertices, dtype=np.float64), np.ascontiguousarray(faces, dtype=np.int64)
 
 
@@ -106,7 +106,7 @@ def loop_operator(vertex_count: int, faces: npt.ArrayLike) -> tuple[Any, IntArra
 
     Args:
         vertex_count: number V of vertices.
-        faces: (F, 3) integer triangles; every edge has one or two of them.
+        faces: (F, 3) integer triangles; every edge belongs to one or two triangles.
 
     Returns:
         A scipy CSR matrix (V + E, V) float64 whose rows are non-negative and sum to one, and (4F, 3) int32.
@@ -122,7 +122,7 @@ def loop_operator(vertex_count: int, faces: npt.ArrayLike) -> tuple[Any, IntArra
     if F.size and (F.min() < 0 or F.max() >= vertex_count):
         raise MeshError(f"Loop subdivision got a face that points outside its {vertex_count} vertices.")
     n_faces = len(F)
-    # Half-edge k of a triangle lies opposite its corner k.
+    # Half-edge k of a triangle is opposite its corner k.
     start, end, apex = F[:, [1, 2, 0]].T.ravel(), F[:, [2, 0, 1]].T.ravel(), F.T.ravel()
     low, high = np.minimum(start, end), np.maximum(start, end)
     key, edge_of, count = np.unique(low * vertex_count + high, return_inverse=True, return_counts=True)
@@ -148,7 +148,7 @@ def loop_operator(vertex_count: int, faces: npt.ArrayLike) -> tuple[Any, IntArra
     beta[on_boundary] = (0.25 / np.maximum(boundary_valence, 1))[on_boundary]
     half_edges = np.concatenate([edges, edges[:, ::-1]])
     both_boundary = np.concatenate([is_boundary, is_boundary])
-    # A boundary vertex listens to its boundary neighbours only, so that two patches meet along a shared rim.
+    # A boundary vertex depends on its boundary neighbours only, so that two patches meet along a shared rim.
     used = ~on_boundary[half_edges[:, 0]] | both_boundary
     rows.append(half_edges[used, 0])
     cols.append(half_edges[used, 1])

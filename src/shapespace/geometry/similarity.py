@@ -1,7 +1,7 @@
 """Least-squares similarity between two matched point sets: equations 8 to 18 of the paper, misprints corrected.
 
-Sources: Arun, Huang and Blostein, PAMI 9(5), 1987; Umeyama, PAMI 13(4), 1991. `docs/paper-map.md` lists what the
-paper prints and what is right.
+Sources: Arun, Huang and Blostein, PAMI 9(5), 1987; Umeyama, PAMI 13(4), 1991. `docs/paper-map.md` lists the
+misprints and their corrections.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from shapespace.errors import InputError
 from shapespace.types import FloatArray, Similarity
 
 _RANK_TOLERANCE = 1e-9  # ratio of singular values; points nearer to a line than rounding determine no rotation
-_PLANAR = 1e-13  # ratio of products; points nearer to the plane z = 0 than float64 rounding lie in it
-_NO_ROTATION = "The matched points lie on a line or coincide, so they determine no rotation; use more points."
+_PLANAR = 1e-13  # ratio of products; points nearer to the plane z = 0 than float64 rounding are in it
+_NO_ROTATION = "The matched points are on a line or coincide, so they determine no rotation; use more points."
 
 POSE = 7
-"""Pose parameters come before the coefficients: rotation, translation, scale."""
+"""Number of pose parameters, which precede the coefficients: rotation, translation, scale."""
 
 
 def fit_similarity(
@@ -24,17 +24,17 @@ def fit_similarity(
 ) -> Similarity:
     """Return the `T_target_source` that minimises sum_i w_i |target_i - (s R source_i + T)|^2.
 
-    The rotation is a proper one even where a mirror image would fit better, and the data may lie on a plane.
+    The rotation is proper even if a mirror image would fit better, and the points may be on a plane.
 
     Args:
         source: (N, 3) points p, mm.
         target: (N, 3) matched points p', mm.
-        weights: (N,) non-negative; None for ones.
-        with_scale: False fits a rigid motion (s = 1).
+        weights: (N,) non-negative weights; None for ones.
+        with_scale: whether to fit the scale; False for a rigid motion (s = 1).
 
     Raises:
-        InputError: shapes differ, values are not finite, weights are negative, or the points with weight lie on
-            a line, so that no rotation is determined.
+        InputError: shapes differ, values are not finite, weights are negative, or the points with positive weight
+            are on a line, so that no rotation is determined.
     """
     if source.ndim != 2 or source.shape[1] != 3 or source.shape != target.shape:
         raise InputError(
@@ -43,7 +43,7 @@ def fit_similarity(
     if weights is None:
         w = np.full(len(source), 1.0 / max(len(source), 1))
     elif weights.shape != (len(source),) or (weights < 0).any() or not np.isfinite(weights).all():
-        raise InputError("The weights of a similarity must be one finite, non-negative number a point.")
+        raise InputError("The weights of a similarity must be one finite, non-negative number per point.")
     else:
         w = weights / max(weights.sum(), np.finfo(float).tiny)
     if not w.any():
@@ -59,7 +59,7 @@ def fit_similarity(
 
     if spread <= 0:
         raise InputError(_NO_ROTATION)
-    R = fit_rotations(H[None], refuse_lines=True)[0]
+    R = fit_rotations(H[None], reject_lines=True)[0]
     s = float((R * H.T).sum() / spread) if with_scale else 1.0  # P18, as corrected
     if s <= 0:
         raise InputError("The matched points are so far from similar that no positive scale fits; check the matches.")
@@ -67,18 +67,18 @@ def fit_similarity(
     return Similarity(s, R, T)
 
 
-def fit_rotations(products: FloatArray, *, refuse_lines: bool = False) -> FloatArray:
+def fit_rotations(products: FloatArray, *, reject_lines: bool = False) -> FloatArray:
     """Return the rotations R (n, D, D) that maximise trace(R H) for products H = q^T q' (n, D, D) of centred points.
 
-    Points in the plane z = 0, as of planar landmarks that are padded with zeros, are rotated within the plane: rotation
-    about an axis of the plane would reflect them.
+    Points in the plane z = 0, such as planar landmarks padded with zeros, are rotated within the plane, because a
+    rotation about an axis of the plane would reflect them.
 
     Args:
-        products: of points (row vectors) and their targets, with D 2 or 3.
-        refuse_lines: refuse products of points on a line.
+        products: (n, D, D) products of centred points (row vectors) and their targets, with D 2 or 3.
+        reject_lines: whether points on a line raise an error.
 
     Raises:
-        InputError: points on a line, or that coincide, with `refuse_lines`.
+        InputError: the points are on a line or coincide, and `reject_lines` is true.
     """
     D = products.shape[1]
     largest = np.abs(products).max(axis=(1, 2), initial=0.0)
@@ -86,10 +86,10 @@ def fit_rotations(products: FloatArray, *, refuse_lines: bool = False) -> FloatA
     off_plane = np.maximum(across.max(axis=(1, 2), initial=0.0), down.max(axis=(1, 2), initial=0.0))
     if D == 3 and bool((off_plane <= _PLANAR * largest).all()):
         out = np.zeros_like(products)
-        out[:, :2, :2], out[:, 2, 2] = fit_rotations(products[:, :2, :2], refuse_lines=refuse_lines), 1.0
+        out[:, :2, :2], out[:, 2, 2] = fit_rotations(products[:, :2, :2], reject_lines=reject_lines), 1.0
         return out
     U, values, Vt = np.linalg.svd(products)  # P13
-    if refuse_lines and (values[:, 1] <= _RANK_TOLERANCE * np.maximum(values[:, 0], np.finfo(float).tiny)).any():
+    if reject_lines and (values[:, 1] <= _RANK_TOLERANCE * np.maximum(values[:, 0], np.finfo(float).tiny)).any():
         raise InputError(_NO_ROTATION)
     V, Ut = Vt.transpose(0, 2, 1), U.transpose(0, 2, 1)
     Z = np.ones((len(products), D))
@@ -98,7 +98,7 @@ def fit_rotations(products: FloatArray, *, refuse_lines: bool = False) -> FloatA
 
 
 def small_poses(x: FloatArray) -> FloatArray:
-    """Return (3V, 7): how x (V, 3) moves by a rotation about each axis, a translation along each, and a scaling."""
+    """Return derivatives (3V, 7) of x (V, 3) by a rotation about each axis, a translation along each, and a scaling."""
     pose = np.zeros((len(x), 3, POSE))
     pose[:, 0, 1], pose[:, 0, 2], pose[:, 1, 2] = x[:, 2], -x[:, 1], x[:, 0]
     pose[:, :, :3] -= pose[:, :, :3].transpose(0, 2, 1)

@@ -22,12 +22,12 @@ _PSEUDO = 1.5e-8  # of the largest singular value; smaller ones of a singular sy
 
 @dataclass(frozen=True, eq=False)
 class ThinPlateSpline:
-    """The map of least bending energy that takes L source landmarks (L, D) to their targets (L, E), with D 2 or 3.
+    """The map of least bending energy from L source landmarks (L, D) to their targets (L, E), with D 2 or 3.
 
     Args:
-        centre: (D,) of the source landmarks.
-        size: centroid size of the source landmarks; the interpolator has them centred and of unit size, for accuracy.
-        interpolator: of scipy, from these to the targets.
+        centre: (D,) centroid of the source landmarks.
+        size: centroid size of the source landmarks, which are centred and scaled to unit size for accuracy.
+        interpolator: interpolator of scipy from the centred and scaled source landmarks to the targets.
     """
 
     centre: FloatArray
@@ -54,14 +54,14 @@ class ThinPlateSpline:
         return ThinPlateSpline(read_only(centre), size, RBFInterpolator(x, target, kernel=kernel, degree=1))  # M8
 
     def apply(self, points: FloatArray) -> FloatArray:
-        """Return the (M, E) places to which the spline maps points (M, D)."""
+        """Return the images (M, E) of points (M, D) under the spline."""
         return np.asarray(self.interpolator((points - self.centre) / self.size), dtype=np.float64)
 
 
 def bending_energy_matrix(reference: FloatArray) -> FloatArray:
     """Return B (L, L), so that trace(y^T B y) is the bending energy of the spline from `reference` (L, D) to y (L, E).
 
-    It is zero for affine maps. Landmarks that coincide have the same place in all maps.
+    It is zero for affine maps. Landmarks that coincide have the same position in all maps.
     """
     size = max(float(np.linalg.norm(reference - reference.mean(axis=0))), 1e-300)
     L, D = reference.shape

@@ -1,4 +1,4 @@
-"""What the mesh doctor asks of a surface, compiled, in linear time and little memory: equal rows, edges, pieces."""
+"""Compiled functions of the mesh doctor, with linear time and little memory: equal rows, edges, pieces."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from shapespace.types import BoolArray, FloatArray, IntArray
 
 @compiled
 def first_of_equal(rows: npt.NDArray[Any]) -> IntArray:
-    """Return (N,) int32, for each of `rows` (N, 3) integers the first row that equals it."""
+    """Return (N,) int32 the index of the first row equal to each of `rows` (N, 3), integers."""
     size = 16
     while size < 2 * len(rows):
         size *= 2
@@ -42,14 +42,14 @@ def sorted_edges(faces: IntArray, vertices: int) -> tuple[npt.NDArray[np.int64],
     """Return the edges of `faces` (F, 3) sorted by lower vertex, then upper, then triangle.
 
     Args:
-        faces: indices below `vertices`.
-        vertices: how many there are.
+        faces: (F, 3) triangles with indices below `vertices`.
+        vertices: number of vertices, V.
 
     Returns:
-        (V + 1,) where the edges of each lower vertex start; (3F,) the upper vertex of each; (3F,) which side of which
-        triangle it is: side k of triangle f, from corner k to the next, is 3 f + k.
+        (V + 1,) the start of the edges of each lower vertex; (3F,) the upper vertex of each edge; (3F,) the side of a
+        triangle that the edge is: side k of triangle f, from corner k to the next, has the number 3 f + k.
     """
-    # Sorted by counting, by the upper vertex first: the second pass keeps the order of the first.
+    # Counting sort by the upper vertex, then by the lower vertex; the second pass preserves the order of the first.
     edges = 3 * len(faces)
     start, rank = np.zeros(vertices + 1, dtype=np.int64), np.zeros(vertices + 1, dtype=np.int64)
     for f in range(len(faces)):
@@ -95,12 +95,12 @@ def single_edges(faces: IntArray, vertices: int) -> IntArray:
 
 @compiled
 def meeting_triangles(faces: IntArray, vertices: int) -> tuple[IntArray, BoolArray, IntArray, int, int]:
-    """Return who meets whom across the edges of `faces` (F, 3).
+    """Return the triangles that meet at the edges of `faces` (F, 3).
 
     Returns:
-        (E, 2) the triangles that meet across each edge of exactly two; (E,) whether both run along it in the same
-        direction, so that one is turned; (L,) the triangles at all other edges, one for each side; the number of edges
-        of one triangle; the number of edges of more than two.
+        (E, 2) the triangles at each edge of exactly two triangles; (E,) whether both pass it in the same direction, so
+        that one is reversed; (L,) the triangles at all other edges, one for each side; the number of edges of one
+        triangle; the number of edges of more than two.
     """
     start, upper, side = sorted_edges(faces, vertices)
     pairs, same_way = np.empty((len(upper) // 2, 2), dtype=np.int32), np.empty(len(upper) // 2, dtype=np.bool_)
@@ -137,7 +137,7 @@ def _root(parent: IntArray, i: int) -> int:
 
 @compiled
 def join(parent: IntArray, links: IntArray) -> None:
-    """Join the sets of `parent` (N,), at first 0 to N - 1, that `links` (E, 2) tie; each set's least is its root."""
+    """Join the sets of `parent` (N,), initially 0 to N - 1, by `links` (E, 2); the root of a set is its minimum."""
     for i in range(len(links)):
         a, b = _root(parent, links[i, 0]), _root(parent, links[i, 1])
         if a < b:
@@ -148,7 +148,7 @@ def join(parent: IntArray, links: IntArray) -> None:
 
 @compiled
 def labels(parent: IntArray) -> tuple[int, IntArray]:
-    """Return how many sets `parent` (N,) holds, and (N,) int32 the set of each, numbered in order of appearance."""
+    """Return the number of sets in `parent` (N,), and (N,) int32 the set of each, numbered in order of appearance."""
     count = 0
     label = np.empty(len(parent), dtype=np.int32)
     for i in range(len(parent)):
@@ -178,7 +178,7 @@ def flat_triangles(vertices: FloatArray, faces: IntArray, tolerance: float) -> B
 
 @compiled
 def middles_and_normals(vertices: FloatArray, faces: IntArray, centre: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return (F, 3) centroids of triangles less `centre`, and (F, 3) normals as long as their areas."""
+    """Return (F, 3) centroids of triangles relative to `centre`, and (F, 3) normals with the area as length."""
     middles, normals = np.empty((len(faces), 3)), np.empty((len(faces), 3))
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]

@@ -1,9 +1,9 @@
-"""Surfaces of label volumes: smooth, closed, and no more than half a voxel from what the labels say.
+"""Surfaces of label volumes: smooth, closed, and within half a voxel of the border of the labels.
 
 The signed distance to the border between labelled and other voxels is smoothed; its level is chosen so that the
-surface encloses the volume of the voxels, since smoothing alone shrinks what is small; and no voxel may change side
+surface encloses the volume of the voxels, since smoothing alone shrinks small objects; and no voxel may change side
 by more than half a voxel (after R. T. Whitaker, "Reducing Aliasing Artifacts in Iso-Surfaces of Binary Volumes",
-2000). Marching cubes, by scikit-image, then gives the triangles. docs/volumes.md compares ways to do it.
+2000). Marching cubes of scikit-image then computes the triangles. docs/volumes.md compares methods.
 """
 
 from __future__ import annotations
@@ -27,26 +27,26 @@ from shapespace.reprs import short_repr
 from shapespace.types import MAX_MEMORY_BYTES, RAS_TO_LPS, BoolArray, FloatArray, IntArray, LabelVolume, Mesh, require
 
 SMOOTH = 1.3
-"""Standard deviation of the smoothing by default, in voxels."""
+"""Default standard deviation of the smoothing, in voxels."""
 MOST_SMOOTH = 10.0
-"""The largest that can be asked for."""
+"""Largest standard deviation of the smoothing, in voxels."""
 
 _SLACK = np.float32(0.5)
 _CLIP = 2.0  # voxels; the distance field is exact up to here and only its sign matters beyond
-# How near to the middle of a voxel the surface may pass, so that no triangle shrinks to nothing.
+# Smallest distance of the surface from the middle of a voxel, so that no triangle degenerates.
 _CLEAR = np.float32(0.05)
-# Shares of the smoothing that are tried where something thin would vanish.
+# Shares of the smoothing that are tried where thin parts would vanish.
 _FINER = (0.5, 0.25)
-# How often voxels that vanish are put back, with more around them each time.
+# Limit of iterations that restore vanished voxels, with more surrounding voxels in each iteration.
 _ROUNDS = 3
-_FEWEST = 8  # voxels, a cube of 2 x 2 x 2: the least with an extent along each axis
-# bisections of the level that keeps the volume, to 1e-6 of the interval, and the step outside it in voxels
+_FEWEST = 8  # voxels, a cube of 2 x 2 x 2: the smallest object with an extent along each axis
+# bisections of the level that preserves the volume, to 1e-6 of the interval, and the step outside it in voxels
 _HALVINGS, _STEP = 20, 0.1
 _BLOCK = 1 << 20
 """Voxels of a volume that are processed together."""
 _MOST_LABELS = 1 << 16
 """A volume with more labels than this is an image, not a segmentation."""
-_BASE_BYTES = 1 << 27  # bytes; interpreter and libraries, whatever the volume
+_BASE_BYTES = 1 << 27  # bytes; interpreter and libraries, independent of the volume
 _VOXEL_BYTES, _VERTEX_BYTES = 32, 400
 """Memory of smoothing and marching cubes: for each voxel of the box around the labels, and for each vertex of the
 surface. Upper bounds of the peaks of resident memory that benchmarks/volume_memory.py measures."""
@@ -62,16 +62,17 @@ class VolumeSurface:
     """The surface of labels in a volume.
 
     Args:
-        mesh: closed, its triangles counter-clockwise seen from outside; LPS, mm.
-        labels: what it encloses: labels, or names of segments if they were chosen by name.
-        voxel_mm: (3,) size of a voxel.
-        voxels: how many it was made of.
-        pieces: how many pieces hang together, by faces or edges of voxels, among those of the labels.
-        left_out: voxels of the pieces that are not in the surface.
-        filled: voxels of cavities that are taken as inside.
-        at_border: voxels on the border of the volume, where the surface is closed though the object may go on.
-        volume_mm3: what the surface encloses.
-        notes: sentences on what should be known.
+        mesh: closed surface, with triangles counter-clockwise seen from outside; LPS, mm.
+        labels: enclosed labels, or names of segments if they were chosen by name.
+        voxel_mm: (3,) size of a voxel, mm.
+        voxels: number of voxels inside the surface.
+        pieces: number of pieces of the labels, connected by faces or edges of voxels.
+        left_out: number of voxels of the pieces that are not in the surface.
+        filled: number of voxels of cavities that count as inside.
+        at_border: number of voxels on the border of the volume, where the surface is closed although the object may
+            continue.
+        volume_mm3: volume that the surface encloses, mm^3.
+        notes: sentences for the user about the surface.
 
     Example:
         >>> labels = np.zeros((9, 9, 9), dtype=np.uint8)
@@ -109,35 +110,35 @@ def surface_of_volume(
     """Return the surface around labels, at sub-voxel accuracy, in LPS mm.
 
     Args:
-        volume: labels and where they lie, as `read_volume` gives them.
-        labels: one, or several that are taken as one object, in a sequence or separated by commas: labels, or names of
-            segments; "all" but 0; None for the only one there is.
-        smooth: standard deviation of the smoothing in voxels, of their mean size where they are not cubes; 0 for none.
-        keep_pieces: keep all pieces and cavities, instead of the largest piece without them.
+        volume: labels and their position, from `read_volume`.
+        labels: labels or names of segments of the object: one, several in a sequence or separated by commas, or "all"
+            for all but 0; None if there is only one.
+        smooth: standard deviation of the smoothing in voxels (of mean size if they are not cubes); 0 for none.
+        keep_pieces: whether to keep all pieces and cavities; False for the largest piece without cavities.
         max_memory_bytes: memory limit for the volume and its surface; the need is estimated from the size of
             the box around the labels and the area of their border, before memory is allocated.
 
     Raises:
-        InputError: no such label, several where none was chosen, too few voxels, more memory than allowed, or a bad
-            `smooth`.
+        InputError: no such label, several labels of which none was chosen, too few voxels, more memory than allowed, or
+            an invalid `smooth`.
         ShapespaceError: the extra `volumes` is not installed.
     """
     require(volume, LabelVolume, "surface_of_volume", "read one with shapespace.io.read_volume")
     if not 0 <= smooth <= MOST_SMOOTH:
         raise InputError(f"The smoothing must be from 0 to {MOST_SMOOTH:g} voxels, not {smooth}.")
-    chosen, wanted = _chosen(volume, labels)
+    chosen, wanted = _select_labels(volume, labels)
     sigma = smooth * np.cbrt(np.prod(volume.voxel_mm)) / volume.voxel_mm
     check_memory = partial(_check_memory, volume, max_memory_bytes)
-    mask, corner = _cut_out(volume, wanted, np.ceil(3 * sigma).astype(int) + 3, check_memory)
+    mask, corner = _crop_labels(volume, wanted, np.ceil(3 * sigma).astype(int) + 3, check_memory)
     part = _Solid.of(mask, keep_pieces=keep_pieces)
     check_memory(mask.shape, count_crossings(part.mask))
     if part.voxels < _FEWEST:
         raise InputError(
-            f"{volume.name}: {_named(chosen)} has only {part.voxels} "
-            f"{'voxel' if part.voxels == 1 else 'voxels that hang together'}; a surface needs {_FEWEST}."
+            f"{volume.name}: {_format_labels(chosen)} has only {part.voxels} "
+            f"{'voxel' if part.voxels == 1 else 'connected voxels'}; a surface needs {_FEWEST}."
         )
-    at_border = _at_border(part.mask, corner, volume.labels.shape[:3])
-    field, share = _smoothed(part, volume.voxel_mm, sigma)
+    at_border = _count_border_voxels(part.mask, corner, volume.labels.shape[:3])
+    field, share = _smooth(part, volume.voxel_mm, sigma)
     vertices, faces = _triangles(field, volume.name)
     points = ((vertices + corner) @ volume.affine[:3, :3].T + volume.affine[:3, 3]) * RAS_TO_LPS
     if np.linalg.det(volume.affine[:3, :3]) < 0:
@@ -160,13 +161,13 @@ def _check_memory(volume: LabelVolume, limit_bytes: int, box: Sequence[int], ver
     """Check the memory of a surface.
 
     Args:
-        volume: the labels.
-        limit_bytes: of the volume and all that is made of it.
-        box: (3,) voxels along each axis of the box around the labels.
-        vertices: of the border of the labels.
+        volume: volume of the labels.
+        limit_bytes: largest allowed memory of the volume and its surface, bytes.
+        box: (3,) numbers of voxels along the axes of the box around the labels.
+        vertices: number of vertices of the border of the labels.
 
     Raises:
-        InputError: it is over the limit.
+        InputError: the memory is over the limit.
     """
     needed = volume.labels.nbytes + estimated_bytes(box, vertices)
     if needed > limit_bytes:
@@ -174,7 +175,7 @@ def _check_memory(volume: LabelVolume, limit_bytes: int, box: Sequence[int], ver
         raise InputError(
             f"{volume.name}: the surface of its labels, in a box of {size} voxels, takes about "
             f"{needed / 2**30:.2g} GiB of memory, over the limit of {limit_bytes / 2**30:.2g} GiB; crop or resample "
-            "it, as by 3D Slicer, or allow more (--max-memory)."
+            "it, for example with 3D Slicer, or allow more (--max-memory)."
         )
 
 
@@ -182,8 +183,8 @@ def estimated_bytes(box: Sequence[int], vertices: int) -> int:
     """Return an upper bound of the memory of smoothing and marching cubes, without the volume.
 
     Args:
-        box: (3,) voxels along each axis of the box around the labels, with its margin.
-        vertices: of the surface, by the pairs of neighbouring voxels on both sides of its border.
+        box: (3,) numbers of voxels along the axes of the box around the labels, with its margin.
+        vertices: number of vertices of the surface, from the pairs of neighbouring voxels across its border.
     """
     return _BASE_BYTES + _VOXEL_BYTES * math.prod(map(int, box)) + _VERTEX_BYTES * vertices
 
@@ -202,10 +203,10 @@ def _blocks(shape: tuple[int, ...]) -> Generator[tuple[slice, slice, slice]]:
 
 
 def labels_in(labels: _Labels) -> tuple[int, ...]:
-    """Return the labels in (X, Y, Z) other than 0, from the lowest.
+    """Return the labels in (X, Y, Z) other than 0, in ascending order.
 
     Raises:
-        InputError: there are more than a segmentation has.
+        InputError: there are more labels than in a segmentation.
     """
     numbers: set[int] = set()
     for block in _blocks(labels.shape):
@@ -215,7 +216,7 @@ def labels_in(labels: _Labels) -> tuple[int, ...]:
             if high - low < 2:
                 numbers.update((low, high))
             elif high - low < _MOST_LABELS:
-                # Subtraction wraps round in uint64, so that it is right for labels below 0 too.
+                # Subtraction in uint64 wraps around, so that it is correct for negative labels too.
                 above = (values.astype(np.uint64) - np.uint64(low % 2**64)).astype(np.intp)
                 numbers.update(low + int(value) for value in np.flatnonzero(np.bincount(above.ravel())))
             else:
@@ -231,17 +232,17 @@ _Places = dict[int, list[int]]
 """Layer -> labels in it that form an object."""
 
 
-def _chosen(
+def _select_labels(
     volume: LabelVolume, labels: int | str | Sequence[int | str] | None
 ) -> tuple[tuple[int | str, ...], _Places]:
-    """Return the labels or names of segments that form the object, and where they are."""
+    """Return the labels or names of segments that form the object, and their layers."""
     try:
         present = [(layer, label) for layer, values in enumerate(volume.layers) for label in labels_in(values)]
     except InputError as error:
         raise InputError(f"{volume.name}: {error}") from error
     if not present:
         raise InputError(f"{volume.name}: all its voxels are 0; give a volume with a label.")
-    segments = {(one.layer, one.label): one for one in volume.segments if (one.layer, one.label) in set(present)}
+    segments = {(item.layer, item.label): item for item in volume.segments if (item.layer, item.label) in set(present)}
     places: dict[int | str, list[tuple[int, int]]] = {}
     for place in present:
         places.setdefault(place[1], []).append(place)
@@ -254,10 +255,10 @@ def _chosen(
     if labels is None and len(present) > 1:
         kind = "segments" if segments else "labels"
         raise InputError(
-            f"{volume.name}: it has the {kind} {listed}; say which (--label), or take all as one (--label all)."
+            f"{volume.name}: it has the {kind} {listed}; choose some (--label), or combine all (--label all)."
         )
     if labels is None or (isinstance(labels, str) and labels == "all" and labels not in places):
-        return tuple(dict.fromkeys(names)), _by_layer(present)
+        return tuple(dict.fromkeys(names)), _group_by_layer(present)
     if isinstance(labels, str):
         parts = [labels] if labels in places else [part.strip() for part in labels.split(",")]
         asked = {int(part) if part not in places and part.lstrip("-").isdecimal() else part for part in parts}
@@ -265,26 +266,30 @@ def _chosen(
         asked = {label if isinstance(label, str) else int(label) for label in np.atleast_1d(np.array(labels, object))}
     absent = tuple(sorted(asked - places.keys(), key=str))
     if absent or not asked:
-        raise InputError(f"{volume.name}: there is no {_named(absent) if absent else 'label'} in it; it has {listed}.")
+        raise InputError(
+            f"{volume.name}: it has no {_format_labels(absent) if absent else 'label'}; choose from {listed}."
+        )
     for label in asked:
         if len(places[label]) > 1:
             choices = ", ".join(segments[p].name if isinstance(label, int) else segments[p].id for p in places[label])
-            raise InputError(f"{volume.name}: {_named((label,))} is in several layers; choose one of {choices}.")
-    return tuple(sorted(asked, key=places.__getitem__)), _by_layer([places[label][0] for label in asked])
+            raise InputError(
+                f"{volume.name}: {_format_labels((label,))} is in several layers; choose one of {choices}."
+            )
+    return tuple(sorted(asked, key=places.__getitem__)), _group_by_layer([places[label][0] for label in asked])
 
 
-def _by_layer(places: Sequence[tuple[int, int]]) -> _Places:
+def _group_by_layer(places: Sequence[tuple[int, int]]) -> _Places:
     return {layer: [label for other, label in places if other == layer] for layer, _ in places}
 
 
-def _named(labels: tuple[int | str, ...]) -> str:
+def _format_labels(labels: tuple[int | str, ...]) -> str:
     return f"label{'s' if len(labels) > 1 else ''} {', '.join(map(str, labels))}"
 
 
-def _cut_out(
+def _crop_labels(
     volume: LabelVolume, wanted: _Places, margin: npt.NDArray[np.int_], check_memory: Callable[[list[int]], None]
 ) -> tuple[BoolArray, FloatArray]:
-    """Return the box around the labels in `wanted` with a margin on each axis, and (3,) where it begins."""
+    """Return the mask of the labels `wanted` in the box around them with a margin, and its first corner (3,)."""
     shape, layers = volume.labels.shape[:3], volume.layers
 
     def inside(block: tuple[slice, ...]) -> BoolArray:
@@ -302,8 +307,8 @@ def _cut_out(
     mask = np.zeros(high - low + 2 * margin, dtype=np.bool_)
     corner = low - margin
     for block in _blocks(shape):
-        begin = [max(one.start, int(offset)) for one, offset in zip(block, low, strict=True)]
-        end = [min(one.stop, int(offset)) for one, offset in zip(block, high, strict=True)]
+        begin = [max(part.start, int(offset)) for part, offset in zip(block, low, strict=True)]
+        end = [min(part.stop, int(offset)) for part, offset in zip(block, high, strict=True)]
         if all(a < b for a, b in zip(begin, end, strict=True)):
             there = tuple(slice(a, b) for a, b in zip(begin, end, strict=True))
             here = tuple(
@@ -314,12 +319,12 @@ def _cut_out(
 
 
 def _is_one_of(values: _Labels, wanted: list[int]) -> BoolArray:
-    # Several times as fast for one label, which is the usual case.
+    # Several times faster for one label, the usual case.
     return values == wanted[0] if len(wanted) == 1 else np.isin(values, wanted)
 
 
 def count_crossings(mask: BoolArray) -> int:
-    """Return the number of pairs of neighbours on both sides of the border: the vertices of marching cubes."""
+    """Return the number of pairs of neighbouring voxels across the border, which are the vertices of marching cubes."""
     count = 0
     for axis in range(3):
         along = np.moveaxis(mask, axis, 0)
@@ -327,8 +332,8 @@ def count_crossings(mask: BoolArray) -> int:
     return count
 
 
-def _at_border(mask: BoolArray, corner: FloatArray, shape: tuple[int, ...]) -> int:
-    """Return how many voxels of `mask`, which begins at `corner` of a volume of that `shape`, are its outermost."""
+def _count_border_voxels(mask: BoolArray, corner: FloatArray, shape: tuple[int, ...]) -> int:
+    """Return the number of voxels of `mask`, whose first corner is `corner`, on the border of a volume of `shape`."""
     inner = tuple(
         slice(max(1 - int(offset), 0), count - 1 - int(offset)) for offset, count in zip(corner, shape, strict=True)
     )
@@ -337,7 +342,7 @@ def _at_border(mask: BoolArray, corner: FloatArray, shape: tuple[int, ...]) -> i
 
 @dataclass(frozen=True, eq=False)
 class _Solid:
-    """Voxels inside a surface: none touch along an edge alone, so that the surface is a sheet however smoothed."""
+    """Voxels inside a surface; none touch only along an edge, so that the surface is a sheet after any smoothing."""
 
     mask: BoolArray
     voxels: int
@@ -346,7 +351,7 @@ class _Solid:
     filled: int
     added: int
     topology: tuple[int, int]
-    """Pieces and cavities that the surface has."""
+    """Numbers of pieces and cavities of the surface."""
 
     @staticmethod
     def of(mask: BoolArray, *, keep_pieces: bool) -> _Solid:
@@ -379,9 +384,9 @@ class _Solid:
 
 
 def _without_edge_contacts(mask: BoolArray) -> BoolArray:
-    """Return `mask` with voxels added until no two of it touch along an edge without one that shares faces with both.
+    """Return `mask` with added voxels, so that two voxels that touch along an edge have a common face neighbour.
 
-    Then no face of a cube of marching cubes is ambiguous, and no edge of the surface has more than two triangles.
+    Then no face of a cell of marching cubes is ambiguous, and no edge of the surface has more than two triangles.
     """
     out = mask.copy()
     while True:
@@ -400,45 +405,45 @@ def _components(mask: BoolArray) -> tuple[IntArray, int]:
     return label, int(count)
 
 
-def _smoothed(part: _Solid, voxel_mm: FloatArray, sigma: FloatArray) -> tuple[_Field, float]:
-    """Return a field that is positive inside, and the share of the smoothing that it has.
+def _smooth(part: _Solid, voxel_mm: FloatArray, sigma: FloatArray) -> tuple[_Field, float]:
+    """Return a field that is positive inside, and its share of the requested smoothing.
 
-    Less is smoothed where pieces would part or join otherwise, and in the end no voxel changes side.
+    The smoothing is reduced if pieces would otherwise split or merge, in the last resort until no voxel changes side.
     """
     distance = _signed_distance(part.mask, voxel_mm)
     for share in (1.0, *_FINER):
-        field = _freed(distance, share * sigma, part)
-        held = np.zeros_like(part.mask)
+        field = _smooth_freely(distance, share * sigma, part)
+        fixed = np.zeros_like(part.mask)
         for _ in range(_ROUNDS):
             side = _without_edge_contacts(field > 0)
             if part.topology == (1, 0):
                 side = _Solid.of(side, keep_pieces=False).mask
-            lost = _vanished(part.mask, side)
+            lost = _find_vanished(part.mask, side)
             if not lost.any():
                 if (_components(side)[1], _components(~side)[1] - 1) == part.topology:
                     return _clear_of_middles(field, side), share
                 break
-            held = _grown(held) | lost
-            field = np.where(held, _clear_of_middles(field, part.mask), field)
-    return _clear_of_middles(_levelled(distance, _FINER[-1] * sigma, part.mask), part.mask), 0.0
+            fixed = _dilate(fixed) | lost
+            field = np.where(fixed, _clear_of_middles(field, part.mask), field)
+    return _clear_of_middles(_smooth_to_volume(distance, _FINER[-1] * sigma, part.mask), part.mask), 0.0
 
 
-def _freed(distance: _Field, sigma: FloatArray, part: _Solid) -> _Field:
-    """Return `distance` smoothed so that voxels change side by half a voxel at most, less where something would vanish.
+def _smooth_freely(distance: _Field, sigma: FloatArray, part: _Solid) -> _Field:
+    """Return smoothed `distance`; voxels change side by at most half a voxel, and less where thin parts would vanish.
 
-    A voxel of something thin that would vanish all the same keeps its side.
+    Voxels of thin parts that would vanish nevertheless keep their side.
     """
     sign = np.where(part.mask, np.float32(1), np.float32(-1))
-    field = _levelled(distance, sigma, part.mask)
+    field = _smooth_to_volume(distance, sigma, part.mask)
     free = sign * np.maximum(sign * field, -_SLACK)
     for finer in _FINER:
-        thin = _vanished(part.mask, free > 0)
+        thin = _find_vanished(part.mask, free > 0)
         if not thin.any():
             return free
-        there = _levelled(distance, finer * sigma, part.mask)
+        there = _smooth_to_volume(distance, finer * sigma, part.mask)
         weight = ndimage.gaussian_filter(thin.astype(np.float32), 1.0)
         free += weight * (sign * np.maximum(sign * there, -_SLACK) - free)
-    return np.where(_vanished(part.mask, free > 0), _clear_of_middles(free, part.mask), free)
+    return np.where(_find_vanished(part.mask, free > 0), _clear_of_middles(free, part.mask), free)
 
 
 def _clear_of_middles(field: _Field, side: BoolArray) -> _Field:
@@ -446,13 +451,13 @@ def _clear_of_middles(field: _Field, side: BoolArray) -> _Field:
     return np.where(side, np.maximum(field, _CLEAR), np.minimum(field, -_CLEAR))
 
 
-def _levelled(distance: _Field, sigma: FloatArray, mask: BoolArray) -> _Field:
+def _smooth_to_volume(distance: _Field, sigma: FloatArray, mask: BoolArray) -> _Field:
     field = ndimage.gaussian_filter(distance, sigma)
     return field - np.float32(_level(field, int(mask.sum())))
 
 
 def _signed_distance(mask: BoolArray, voxel_mm: FloatArray) -> _Field:
-    """Return the distance of each voxel from the border of `mask` in voxels of mean size, positive inside, cut off."""
+    """Return the distance of each voxel from the border of `mask` in voxels of mean size, positive inside, clipped."""
     step = voxel_mm / np.cbrt(np.prod(voxel_mm))
     half = 0.5 * float(step.min())
 
@@ -463,9 +468,10 @@ def _signed_distance(mask: BoolArray, voxel_mm: FloatArray) -> _Field:
 
 
 def _squared_distance(side: BoolArray, step: FloatArray, most: float) -> _Field:
-    """Return the squared distance from each voxel of `side` to the nearest other, at most that of `most`.
+    """Return the squared distance from each voxel of `side` to the nearest other voxel, at most the square of `most`.
 
-    One axis after the other, as squares add up; SciPy's transform, without a bound, takes ten times as long.
+    Axes are processed one after the other, because squares are additive; SciPy's transform, which has no bound, takes
+    ten times as long.
     """
     squared = np.where(side, np.float32(most**2), np.float32(0))
     for axis, length in enumerate(step):
@@ -480,7 +486,7 @@ def _squared_distance(side: BoolArray, step: FloatArray, most: float) -> _Field:
 
 
 def _level(field: _Field, voxels: int) -> float:
-    """Return the level at which the surface of `field`, in voxels from the border, encloses as much as `voxels`."""
+    """Return the level at which the surface of `field` (voxels from the border) encloses the volume of `voxels`."""
     near = field[np.abs(field) < _CLIP]
     wanted = voxels - int((field >= _CLIP).sum())
     low, high = -1.0, 1.0
@@ -490,7 +496,7 @@ def _level(field: _Field, voxels: int) -> float:
             low = middle
         else:
             high = middle
-    # The triangles cut corners; how much goes by their volume at two levels.
+    # Triangles cut corners; this volume is estimated from the enclosed volumes at two levels.
     levels = (low, low - _STEP)
     if not float(field.min()) < levels[1] < low < float(field.max()):
         return low
@@ -498,13 +504,13 @@ def _level(field: _Field, voxels: int) -> float:
     return low + _STEP * min(max((less - voxels) / (more - less), -1.0), 1.0)
 
 
-def _vanished(mask: BoolArray, side: BoolArray) -> BoolArray:
-    """Return where, and two voxels around, a voxel of `mask` or of the rest has no neighbour on its side in `side`."""
-    lost = (mask & ~_grown(side)) | (~mask & ~_grown(~side))
-    return _grown(_grown(lost)) if lost.any() else lost
+def _find_vanished(mask: BoolArray, side: BoolArray) -> BoolArray:
+    """Return the voxels without a neighbour on their side of `mask` in `side`, and two voxels around these."""
+    lost = (mask & ~_dilate(side)) | (~mask & ~_dilate(~side))
+    return _dilate(_dilate(lost)) if lost.any() else lost
 
 
-def _grown(mask: BoolArray) -> BoolArray:
+def _dilate(mask: BoolArray) -> BoolArray:
     """Return `mask` with the 26 neighbours of its voxels."""
     for axis in range(3):
         before = np.moveaxis(mask, axis, 0)
@@ -516,10 +522,10 @@ def _grown(mask: BoolArray) -> BoolArray:
 
 
 def _triangles(field: _Field, name: str) -> tuple[FloatArray, IntArray]:
-    """Return vertices in voxels and triangles where `field` is zero, seen from outside counter-clockwise."""
+    """Return vertices (in voxels) and triangles of the zero level of `field`, counter-clockwise seen from outside."""
     points, faces = _marching_cubes(field, 0.0)
     if not is_sheet(faces) or len(boundary_edges(faces)):
-        raise MeshError(f"{name}: its surface is no closed sheet; smooth or mend the labels first.")
+        raise MeshError(f"{name}: its surface is not a closed sheet; smooth or correct the labels first.")
     return points, faces
 
 
@@ -537,19 +543,19 @@ def _marching_cubes(field: _Field, level: float) -> tuple[FloatArray, IntArray]:
 def _notes(part: _Solid, voxel_mm: FloatArray, at_border: int, share: float) -> list[str]:
     notes: list[str] = []
     if at_border:
-        notes.append("It touches the border of the volume, where the surface is closed; what lies beyond is missing.")
+        notes.append("It touches the border of the volume, where the surface is closed; parts beyond it are missing.")
     others = part.pieces - 1
     if part.left_out:
         notes.append(
             f"{others} smaller {'piece' if others == 1 else 'pieces'} with {part.left_out} of "
-            f"{part.voxels + part.left_out} voxels {'is' if others == 1 else 'are'} left out."
+            f"{part.voxels + part.left_out} voxels {'is' if others == 1 else 'are'} omitted."
         )
     elif others and part.topology[0] > 1:
         notes.append(f"It is in {part.pieces} pieces.")
     if part.filled:
         notes.append(f"Cavities of {part.filled} {'voxel' if part.filled == 1 else 'voxels'} inside it are filled.")
     if share < 1:
-        notes.append("Parts of it are so thin that it is smoothed less, lest they vanish.")
+        notes.append("Parts of it are so thin that the smoothing was reduced to preserve them.")
     if (ratio := float(voxel_mm.max() / voxel_mm.min())) >= _LONG:
         notes.append(f"Its voxels are {ratio:.2g} times as long as wide; between slices the surface is a guess.")
     return notes

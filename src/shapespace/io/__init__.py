@@ -1,7 +1,7 @@
-"""Files: readers with bounds, writers that leave whole files, and meshes of other tools.
+"""Files: readers with limits on size and memory, atomic writers, and conversion of meshes of other tools.
 
 Entry points: `meshes.mesh_io`, `landmarks.landmark_io`, `volume_io`, `tables.table_io`, `interop`. Imported by
-every layer above; knows no model.
+every layer above; does not depend on models.
 """
 
 from typing import TYPE_CHECKING

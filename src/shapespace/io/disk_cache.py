@@ -1,6 +1,6 @@
-"""The cache on disk: arrays that later runs would compute again, in the user's cache folder up to a bound.
+"""The cache on disk: computed arrays for later runs, in the user's cache folder, up to a total size.
 
-`key` names an entry by all that it depends on. A file holds the SHA-256 of an `.npz` in hexadecimal, then the `.npz`.
+`key` names an entry by all its inputs. A file contains the SHA-256 of an `.npz` in hexadecimal, then the `.npz`.
 An entry that is damaged, or cannot be read or written, counts as missing: the caller computes it again. `clear` removes
 all entries, as `shapespace cache --clear` does; those in memory are in `memory_cache`.
 """
@@ -24,20 +24,20 @@ from shapespace.io.files import atomic_path, remove_file
 from shapespace.version import __version__
 
 MOST_BYTES = 500_000_000
-"""The files used last stay below this together."""
+"""Limit of the total size of all entries; those that were not used for the longest time are removed."""
 _FOLDER, _ENDING = "kept", ".kept"
 _DIGEST_BYTES = 64  # hexadecimal digits of SHA-256
 _OFF = ("no", "off", "0")
 
 
 def cache_folder() -> Path:
-    """Return the folder of downloads and kept arrays: `SHAPESPACE_CACHE`, or the platform's own cache folder."""
+    """Return the folder of downloads and cached arrays: `SHAPESPACE_CACHE`, or the platform's own cache folder."""
     configured = os.environ.get("SHAPESPACE_CACHE")
     return Path(configured) if configured else user_cache_path("shapespace")
 
 
 def entries_folder() -> Path | None:
-    """Return the folder of the entries, which `SHAPESPACE_KEEP` may name; None where that switches the cache off."""
+    """Return the folder of the entries, which `SHAPESPACE_KEEP` may set; None if that variable disables the cache."""
     word = os.environ.get("SHAPESPACE_KEEP", "")
     if word.lower() in _OFF:
         return None
@@ -48,8 +48,8 @@ def key(kind: str, version: int, *dependencies: object) -> str:
     """Return the name of an entry.
 
     Args:
-        kind: of the arrays, such as "residual".
-        version: of the algorithm that computes them, raised whenever its results change.
+        kind: kind of the arrays, such as "residual".
+        version: version of the algorithm that computes the arrays, increased whenever its results change.
         dependencies: all other inputs: the content hash of a model, settings. The version of shapespace is added.
     """
     text = "\n".join((str(version), __version__, *map(str, dependencies)))
@@ -78,7 +78,7 @@ def _file(name: str) -> Path | None:
 
 
 def recall(name: str) -> dict[str, npt.NDArray[Any]] | None:
-    """Return the arrays kept as `name`; None where there are none, or none that are whole."""
+    """Return the arrays of the entry `name`, or None if it is missing or damaged."""
     path = _file(name)
     if path is None:
         return None
@@ -92,12 +92,12 @@ def recall(name: str) -> dict[str, npt.NDArray[Any]] | None:
     except (OSError, ValueError):
         return None
     with contextlib.suppress(OSError):
-        os.utime(path)  # what is used is the last to go
+        os.utime(path)  # entries that are used are removed last
     return arrays
 
 
 def keep(name: str, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
-    """Keep `arrays` as `name`, and drop what was used longest ago beyond `MOST_BYTES`; no folder is no error."""
+    """Store `arrays` as `name`, and remove the least recently used entries beyond `MOST_BYTES`; errors are ignored."""
     path = _file(name)
     if path is None or sum(array.nbytes for array in arrays.values()) > MOST_BYTES:
         return
@@ -105,7 +105,7 @@ def keep(name: str, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as temporary, temporary.open("w+b") as stream:
             stream.write(b"0" * _DIGEST_BYTES)
-            stored: dict[str, Any] = dict(arrays)  # savez has keywords of its own type
+            stored: dict[str, Any] = dict(arrays)  # the keywords of savez have another type
             np.savez(stream, **stored)
             stream.seek(_DIGEST_BYTES)
             digest = hashlib.file_digest(stream, "sha256").hexdigest()

@@ -35,7 +35,7 @@ _WRITE_HINTS = {
 
 
 def _host() -> str:
-    """Return a word for this machine; on Linux also for the process numbers of this container."""
+    """Return an identifier of this machine and, on Linux, of the process namespace of this container."""
     try:
         space = Path("/proc/self/ns/pid").stat().st_ino
     except OSError:
@@ -57,7 +57,7 @@ def write_error(path: Path, error: OSError) -> FileError:
 
 
 def read_error(path: Path, error: OSError) -> FileError:
-    """Return the one-sentence error for an `OSError` met while reading `path`; a `FileError` has its sentence."""
+    """Return the one-sentence error for an `OSError` met while reading `path`; a `FileError` is returned as it is."""
     if isinstance(error, FileError):
         return error
     if isinstance(error, FileNotFoundError):
@@ -88,13 +88,13 @@ def writing(path: Path) -> Generator[None]:
 
 
 def open_file(path: Path) -> BufferedReader:
-    """Open the regular file `path` for reading; a pipe or a device, which may give nothing or never end, is refused.
+    """Open the regular file `path` for reading; pipes and devices, which may block or never end, are rejected.
 
     Raises:
         FileError: it does not exist, cannot be read, or is no file.
     """
     with reading(path):
-        # Without this flag, opening a pipe waits for somebody to write into it.
+        # Without O_NONBLOCK, opening a pipe blocks until another process writes into it.
         handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
         try:
             mode = os.fstat(handle).st_mode
@@ -109,11 +109,11 @@ def open_file(path: Path) -> BufferedReader:
 
 
 def read_bytes(path: Path, at_most: int | None = None) -> bytes:
-    """Return the whole content of `path`.
+    """Return the complete content of `path`.
 
     Args:
-        path: a regular file.
-        at_most: bytes; a longer file is not read. None for any length.
+        path: path of a regular file.
+        at_most: largest allowed size of the file, bytes; None for any size.
 
     Raises:
         FileError: it does not exist, cannot be read, is no file, or is too long.
@@ -122,8 +122,8 @@ def read_bytes(path: Path, at_most: int | None = None) -> bytes:
         size = os.fstat(stream.fileno()).st_size
         if at_most is not None and size > at_most:
             raise FileError(
-                f"Cannot read {path}: it has {size / 2**20:.1f} MiB, and files of this kind are read up to "
-                f"{at_most / 2**20:.0f} MiB; thin or split it first."
+                f"Cannot read {path}: it has {size / 2**20:.1f} MiB, and the limit for such files is "
+                f"{at_most / 2**20:.0f} MiB; decimate or split it first."
             )
         return stream.read() if at_most is None else stream.read(size)
 
@@ -141,13 +141,13 @@ def make_folder(path: Path) -> Path:
 
 @contextlib.contextmanager
 def atomic_path(path: Path) -> Generator[Path]:
-    """Yield a temporary path beside `path` that replaces it when the block ends well and vanishes otherwise.
+    """Yield a temporary path in the folder of `path`; it replaces `path` if the block succeeds, or is removed.
 
     Raises:
         FileError: the folder cannot be written, or the disk is full.
     """
     path = Path(path)
-    temporary = _temporary_beside(path)
+    temporary = _make_temporary_file(path)
     try:
         yield temporary
         _move_into_place(temporary, path)
@@ -161,16 +161,16 @@ def write_together(files: Mapping[Path, Callable[[Path], object]], remove: Itera
     """Write several files so that the last is complete and matches the others, or is absent, after any interruption.
 
     Args:
-        files: what writes each, given a temporary path.
-        remove: what goes as these come.
+        files: path of each file -> function that writes the file to a given temporary path.
+        remove: files that are removed before the new files are moved into place.
 
     Raises:
-        FileError: the folder cannot be written, or the disk is full; what was there is there still.
+        FileError: the folder cannot be written, or the disk is full; existing files are unchanged.
     """
     with contextlib.ExitStack() as stack:
         written: dict[Path, Path] = {}
         for path, write in files.items():
-            written[path] = _temporary_beside(path)
+            written[path] = _make_temporary_file(path)
             stack.callback(written[path].unlink, missing_ok=True)
             with writing(path):
                 write(written[path])
@@ -183,7 +183,7 @@ def write_together(files: Mapping[Path, Callable[[Path], object]], remove: Itera
 
 @contextlib.contextmanager
 def temporary_folder(parent: Path) -> Generator[Path]:
-    """Yield a new folder in `parent` that vanishes when the block ends, or with the next write after a kill.
+    """Yield a new folder in `parent`; it is removed after the block, or before the next write if the process is killed.
 
     Raises:
         FileError: `parent` cannot be written.
@@ -199,7 +199,7 @@ def _prefix(stem: str) -> str:
     return f"{_TEMPORARY}{_HOST}-{os.getpid()}-{stem}."
 
 
-def _temporary_beside(path: Path) -> Path:
+def _make_temporary_file(path: Path) -> Path:
     _sweep_once(path.parent)
     # The temporary file of a temporary file also contains the name of its target.
     stem = path.stem.split("-", 3)[-1] if path.name.startswith(_TEMPORARY) else path.stem
@@ -210,7 +210,7 @@ def _temporary_beside(path: Path) -> Path:
 
 
 def _sweep_once(folder: Path) -> None:
-    """Remove what killed processes left in `folder`, before this process first writes there."""
+    """Remove the temporary files of killed processes from `folder`, before this process first writes there."""
     folder = folder.absolute()
     if folder not in _swept:
         _swept.add(folder)
@@ -227,8 +227,8 @@ def _move_into_place(temporary: Path, path: Path) -> None:
 def sweep(folder: Path) -> None:
     """Remove the temporary files and folders of processes that were killed as they wrote into `folder`.
 
-    Every writer does so before its first file in a folder. Those of another machine, or of any on Windows, are left
-    for an hour, since whether their process still writes cannot be known.
+    Every writer does so before its first file in a folder. Files of another machine, and all files on Windows, are kept
+    for an hour, because it cannot be determined whether their process is still running.
     """
     for path in folder.glob(f"{_TEMPORARY}*-*-*"):
         host, pid = path.name.removeprefix(_TEMPORARY).split("-")[:2]
@@ -252,7 +252,7 @@ def _is_process_over(pid: int) -> bool:
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write `data` to `path`, whole or not at all.
+    """Write `data` to `path` atomically.
 
     Raises:
         FileError: the folder cannot be written, or the disk is full.
@@ -262,7 +262,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write `text` to `path` as UTF-8 with newlines as they are, whole or not at all.
+    """Write `text` to `path` as UTF-8 with unchanged newlines, atomically.
 
     Raises:
         FileError: the folder cannot be written, or the disk is full.
@@ -271,7 +271,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def remove_file(path: Path) -> None:
-    """Remove `path` if it is there.
+    """Remove `path` if it exists.
 
     Raises:
         FileError: it cannot be removed.

@@ -15,23 +15,23 @@ from shapespace.lazy import lazy_import, require_package
 from shapespace.types import ByteArray, IntArray, Mesh
 
 MeshLike: TypeAlias = Mesh | str | os.PathLike[str] | Any
-"""What `as_mesh` takes: a mesh, a path, or a mesh of another tool."""
+"""Input of `as_mesh`: a mesh, a path, or a mesh of another tool."""
 
 
 def as_mesh(x: MeshLike, name: str = "") -> Mesh:
-    """Return `x` as a mesh, its vertices in their order and own unit, its polygons in triangles.
+    """Return `x` as a mesh with its vertices in their order and unit, and polygons split into triangles.
 
-    Colours of vertices come along; textures and what else other tools keep are left out, and landmarks are those of a
-    `Mesh` alone.
+    Vertex colours are kept; textures and other data of other tools are ignored, and landmarks are kept from a `Mesh`
+    only.
 
     Args:
         x: a `Mesh`, which is returned as it is; the path of a mesh file; an object of trimesh, PyVista, Open3D, meshio
             or menpo; an array (V, 3) of points; or vertices (V, 3) and triangles (F, 3) as a pair.
-        name: what messages and result files call it; empty for what `x` says, or `mesh`.
+        name: name of the mesh in messages and result files; empty for the name that `x` has, or `mesh`.
 
     Raises:
         FileError: the file cannot be read.
-        InputError: `x` is none of these, or has cells that are no surface.
+        InputError: `x` is no such object, or has cells that are not a surface.
         MeshError: arrays of the wrong shape.
     """
     if isinstance(x, Mesh):
@@ -48,7 +48,7 @@ def as_mesh(x: MeshLike, name: str = "") -> Mesh:
     except (TypeError, ValueError) as error:
         if isinstance(error, MeshError):
             raise
-        raise InputError(f"{mesh_name}: its vertices are no numbers of the shape (V, 3).") from error
+        raise InputError(f"{mesh_name}: its vertices are not numbers of the shape (V, 3).") from error
 
 
 class _MeshSequence(Sequence[Mesh]):
@@ -74,12 +74,12 @@ def as_meshes(items: Any, function: str) -> Sequence[Mesh]:
     """Return a sequence of meshes from anything that `as_mesh` takes; each is converted when it is accessed.
 
     Args:
-        items: a list, or anything with a length and items; an array (N, V, 3) too; the folder of meshes, of which those
-            that `build` takes are read.
-        function: that was given it, for the message.
+        items: a list or another sequence of meshes; an array (N, V, 3); or the path of a folder, of which those meshes
+            are read that `build` would use.
+        function: name of the function that received `items`, used in messages.
 
     Raises:
-        InputError: it is no such sequence. An item that is no mesh raises when it is accessed.
+        InputError: `items` is no such sequence. An item that is not a mesh raises it when the item is accessed.
     """
     if isinstance(items, str | os.PathLike) and Path(cast("str | os.PathLike[str]", items)).is_dir():
         return _MeshSequence(lazy_import("trusted_surfaces")(Path(cast("str | os.PathLike[str]", items))))
@@ -119,8 +119,9 @@ def _mesh_arrays(x: Any, mesh_name: str) -> tuple[Any, Any]:
     if hasattr(x, "points"):  # Open3D's clouds
         return x.points, None
     raise InputError(
-        f"{type(x).__module__}.{type(x).__qualname__} is no mesh that shapespace knows; give a shapespace.Mesh, a "
-        "path, a mesh of trimesh, PyVista, Open3D, meshio or menpo, or vertices and triangles as a pair of arrays."
+        f"{type(x).__module__}.{type(x).__qualname__} is not a mesh type that shapespace supports; give a "
+        "shapespace.Mesh, a path, a mesh of trimesh, PyVista, Open3D, meshio or menpo, or vertices and "
+        "triangles as a pair of arrays."
     )
 
 
@@ -132,7 +133,7 @@ def _triangles_of_cells(cells: Mapping[str, Any], mesh_name: str) -> IntArray | 
     others = sorted(set(cells) - {"triangle", "quad", "vertex", "line"})
     if others:
         raise InputError(
-            f"{mesh_name}: it has cells of type {others[0]}, which are no surface; extract the surface first."
+            f"{mesh_name}: it has cells of type {others[0]}, which are not a surface; extract the surface first."
         )
     return np.concatenate(blocks).astype(np.int32) if blocks else None
 
@@ -140,18 +141,18 @@ def _triangles_of_cells(cells: Mapping[str, Any], mesh_name: str) -> IntArray | 
 def _pyvista_arrays(x: Any, mesh_name: str) -> tuple[Any, Any]:
     if not hasattr(x, "faces"):
         if hasattr(x, "extract_surface"):
-            raise InputError(f"{mesh_name}: a grid is no surface; give what its extract_surface() returns.")
+            raise InputError(f"{mesh_name}: a grid is not a surface; give the result of its extract_surface().")
         return x.points, None
     if not len(x.faces):
         return x.points, None
     if not x.is_all_triangles:
         x = x.triangulate()
-    # Each triangle stands there after the number 3.
+    # Each triangle is stored as the number 3 and its three vertices.
     return x.points, np.asarray(x.faces).reshape(-1, 4)[:, 1:]
 
 
 def _colours_of(x: Any, count: int) -> ByteArray | None:
-    """Return the colours (V, 3) of the vertices of an object of another tool, where it has some for each."""
+    """Return the vertex colours (V, 3) of an object of another tool, or None unless each vertex has a colour."""
     values: Any = None
     if getattr(getattr(x, "visual", None), "kind", None) == "vertex":  # trimesh
         values = x.visual.vertex_colors
@@ -179,7 +180,7 @@ def _colours_of(x: Any, count: int) -> ByteArray | None:
     if colours.dtype.kind == "f":
         if not np.isfinite(colours).all():
             return None
-        # As Open3D and menpo have them, from 0 to 1.
+        # Open3D and menpo store colours from 0 to 1.
         colours = np.rint(255.0 * np.clip(colours, 0.0, 1.0))
     return np.clip(colours, 0, 255).astype(np.uint8)
 

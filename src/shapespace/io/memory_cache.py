@@ -37,7 +37,7 @@ def cached_with_owner(
 
         @functools.wraps(compute)
         def cached(owner: OwnerT, *args: P.args, **kwargs: P.kwargs) -> ValueT:
-            # In the object and not in a weak dictionary: a value that refers to its own key would never be freed.
+            # Stored in the object, because a weak dictionary would never free a value that refers to its own key.
             values: dict[Hashable, ValueT] = vars(owner).setdefault(_ATTRIBUTE, {}).setdefault(name, {})
             key = (args, *sorted(kwargs.items()))
             if key not in values:
@@ -54,7 +54,7 @@ def cached_with_owner(
 
 
 class LatestValue(Generic[ValueT]):
-    """The value of the last key that was asked for, such as the model of the batch that runs in this process."""
+    """The value of the last requested key, such as the model of the batch that runs in this process."""
 
     def __init__(self) -> None:
         self._entry: tuple[Hashable, ValueT] | None = None
@@ -88,7 +88,7 @@ _MEMINFO, _CGROUP = Path("/proc/meminfo"), Path("/sys/fs/cgroup")
 
 
 def available_bytes() -> int | None:
-    """Return the bytes that this process can still take; None where the system does not tell."""
+    """Return the bytes of memory that this process can still allocate; None if the system does not report them."""
     sizes = [size for size in (_system_bytes(), _container_bytes()) if size is not None]
     return min(sizes) if sizes else None
 

@@ -21,7 +21,7 @@ IndexArray = npt.NDArray[np.int64]
 
 CUT_SHORT = "the file is damaged or cut short, so export it again"
 
-# Words of text take forty times their own memory as Python objects, so only this much of it is cut at a time.
+# Words of text take forty times their size as Python objects, so text is split in blocks of this size.
 _BLOCK_BYTES = 1 << 18
 _LINE_END = re.compile(rb"\r?\n|\r")
 _SPACE = re.compile(rb"\s")
@@ -29,17 +29,17 @@ _WORD = re.compile(rb"\s*(\S+)[ \t]*\r?\n?")
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 SPACE = "SPACE=LPS"
 """Mark of the frame in headers of meshes, as 3D Slicer writes it."""
-# As a comment, or as a field of legacy VTK, whose text has its length before it in binary files.
+# In a comment, or in a field of legacy VTK, which precedes text with its length in binary files.
 _RAS = re.compile(rb"\bSPACE(?:\s*[=:]\s*|\s+1\s+1\s+\w*string\s+)\W?(?:RAS|right-anterior-superior)\b", re.IGNORECASE)
 _RAS_NOTE = "Its header states the frame RAS; it was converted to LPS."
 _COMMENT = re.compile(rb"\s*(#|//|%|comment\b|.*=)")
-"""Lines with no coordinates: comments, and those of TPS with a key; the attributes of XML have none either."""
+"""Lines without coordinates: comments, lines of TPS with a key, and attributes of XML."""
 _WORD_END = re.compile(rb"[\s;<>]+")
 _WITH_COMMA = re.compile(rb"[+-]?\d*,\d+([eE][+-]?\d+)?")
 _COMMA_OF_NUMBER = re.compile(rb"(?<![^\s;<>])([+-]?\d*),(\d+(?:[eE][+-]?\d+)?)(?![^\s;<>])")
 _NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _OTHER_ROLES = frozenset({"separator", "point"})
-"""Of commas and points in numbers, none of which is together with decimal commas in one file."""
+"""Roles of commas and points in numbers that exclude decimal commas in the same file."""
 _COMMA_AT_NUMBER = re.compile(rb",[+\-.\d]")
 _LEADING_ZERO, _LEADING_ZEROS = re.compile(rb"0\d+"), re.compile(rb"[+-]?0\d")
 _THIN_SPACES = ("\u00a0".encode(), "\u2009".encode(), "\u202f".encode())
@@ -62,23 +62,23 @@ def is_number(text: str | bytes) -> bool:
 
 
 def plain_text(data: bytes) -> bytes:
-    """Return `data` without the mark with which some programs begin text in UTF-8."""
+    """Return `data` without the byte order mark of UTF-8."""
     return data.removeprefix(_BYTE_ORDER_MARK)
 
 
 def numeric_text(data: bytes, path: Path, start: int = 0, *, commas_separate: bool = False) -> bytes:
-    """Return text without its mark of UTF-8, and with points for the decimal commas of some locales.
+    """Return text without its byte order mark, and with decimal points instead of the decimal commas of some locales.
 
-    A comma is a decimal mark where the numbers of a line are separated otherwise: `1,5 2,0 3` or `1,5; 2,0; 3`.
+    A comma is a decimal mark if the numbers of a line have other separators: `1,5 2,0 3` or `1,5; 2,0; 3`.
 
     Args:
-        data: the file.
-        path: for messages.
-        start: where the numbers begin, after a header.
+        data: content of the file.
+        path: path of the file, used in messages.
+        start: index of the first byte after the header.
         commas_separate: whether the format allows commas between numbers, which become spaces: `1.5,2,3`, `1.5, 2, 3`.
 
     Raises:
-        FileFormatError: commas that can be read in two ways, or numbers with decimal commas and with points.
+        FileFormatError: ambiguous commas, or decimal commas and decimal points in the same file.
     """
     data = plain_text(data)
     if any(space in data for space in _THIN_SPACES) and (cut := _THOUSANDS_WITH_SPACES.search(data, start)):
@@ -86,7 +86,7 @@ def numeric_text(data: bytes, path: Path, start: int = 0, *, commas_separate: bo
         raise damage_error(
             path, f"it has spaces for thousands in line {number} ({here!r}); export it again without them"
         )
-    # Most files have no such comma, or one in a comment; their lines are not looked at one by one.
+    # Most files have no such comma, or only in a comment, and skip the slow check of each line.
     if data.find(b",", start) < 0 or not (commas_separate or _COMMA_AT_NUMBER.search(data, start)):
         return data
     out, first = list[bytes](), dict[str, int]()
@@ -114,21 +114,21 @@ def _role_of_commas(line: bytes, commas_separate: bool) -> str:
     has_comma = b"," in line
     if not (has_comma or b"." in line) or _COMMENT.match(line):
         return "none"
-    words = [word for word in (one.strip(b",") for one in _WORD_END.split(line)) if word]
+    words = [word for word in (part.strip(b",") for part in _WORD_END.split(line)) if word]
     plain = [word for word in words if _NUMBER.fullmatch(word)]
     decimal = [word for word in words if _WITH_COMMA.fullmatch(word)]
     lists = [word for word in words if b"," in word and word not in decimal]
-    # A name of a part or material may have a number; coordinates are two or more, or alone in a line.
+    # The name of a part or material may contain a number; coordinates are several numbers, or a number alone in a line.
     is_numeric = len(plain) + len(decimal) > 1 or len(plain) + len(decimal) == len(words)
     has_points = is_numeric and any(b"." in word for word in plain)
     if decimal and len(words) > commas_separate and (is_numeric or (commas_separate and lists)):
         between = commas_separate and re.search(rb",[\s;]|[\s;],", line.strip())
-        # A word that begins with zeros is the rest of a number that a space cuts into thousands.
+        # A word that begins with zeros is the rest of a number with spaces between thousands.
         is_cut = any(map(_LEADING_ZEROS.match, decimal))
         return "unclear" if has_points or lists or between or is_cut else "decimal"
     if commas_separate and has_comma:
         cells = b",".join([*lists, *plain]).split(b",")
-        # Thousands, or the digits after a decimal comma, which begin with a zero as no whole number does.
+        # Thousands, or the digits after a decimal comma, which may begin with a zero, unlike an integer.
         is_cut = any(map(_LEADING_ZERO.fullmatch, cells)) or (len(words) > 1 and any(map(_THOUSANDS.match, words)))
         return "unclear" if is_cut else "separator" if any(map(_NUMBER.fullmatch, cells)) else "none"
     is_list = any(len(cells := word.split(b",")) > 2 and all(map(_NUMBER.fullmatch, cells)) for word in lists)
@@ -142,7 +142,7 @@ def _block(text: bytes, start: int, end: re.Pattern[bytes], size: int = _BLOCK_B
 
 
 def line_blocks(text: bytes) -> Iterator[list[bytes]]:
-    """Yield the lines of `text` in lists of some thousand, so that cutting it takes little memory."""
+    """Yield the lines of `text` in lists of some thousand, so that splitting the text takes little memory."""
     offset = 0
     while offset < len(text):
         block, offset = _block(text, offset, _LINE_END)
@@ -150,21 +150,21 @@ def line_blocks(text: bytes) -> Iterator[list[bytes]]:
 
 
 class WordCursor:
-    """Read position in text of words between white space, of which few are in memory at a time.
+    """Read position in text of words between white space; only a few words are in memory at a time.
 
     Args:
-        data: the file.
-        path: for messages.
-        position: of the first byte to read.
+        data: content of the file.
+        path: path of the file, used in messages.
+        position: index of the first byte to read.
     """
 
     def __init__(self, data: bytes, path: Path, position: int = 0) -> None:
         self.data, self.path, self.position = data, path, position
         self.left = len(data) - position + 1
-        """Bytes of text from the first position on, and one for the space that the last word does without."""
+        """Bytes of text from the first position on, plus 1 because no space follows the last word."""
 
     def word(self) -> bytes:
-        """Return the next word, or nothing at the end."""
+        """Return the next word, or empty bytes at the end."""
         match = _WORD.match(self.data, self.position)
         if match is None:
             return b""
@@ -172,7 +172,7 @@ class WordCursor:
         return match[1]
 
     def words(self, count: int) -> Iterator[list[bytes]]:
-        """Yield the next `count` words in lists; fewer where the text ends."""
+        """Yield the next `count` words in lists; fewer if the text ends before."""
         while count > 0 and self.position < len(self.data):
             block, stop = _block(self.data, self.position, _SPACE, 16 * count)
             words = block.split(None, count)
@@ -187,7 +187,7 @@ def floats_of(text: bytes, path: Path) -> FloatArray:
     """Return the numbers in `text`, between white space, as a flat float64 array.
 
     Raises:
-        FileFormatError: one of them is not a number.
+        FileFormatError: a word is not a number.
     """
     return join_parts([floats(words, path) for words in WordCursor(text, path).words(len(text))], np.float64)
 
@@ -196,7 +196,7 @@ def ints_of(text: bytes, path: Path) -> IndexArray:
     """Return the numbers in `text`, between white space, as a flat int64 array.
 
     Raises:
-        FileFormatError: one of them is not a whole number, or is too large for 64 bits.
+        FileFormatError: a word is not an integer, or is too large for 64 bits.
     """
     return join_parts([ints(words, path) for words in WordCursor(text, path).words(len(text))], np.int64)
 
@@ -210,28 +210,28 @@ def floats(tokens: Iterable[bytes], path: Path) -> FloatArray:
     """Return `tokens` as a flat float64 array.
 
     Raises:
-        FileFormatError: one of them is not a number.
+        FileFormatError: a word is not a number.
     """
     try:
         return np.fromiter(map(float, tokens), dtype=np.float64)
     except ValueError as error:
         comma = ", perhaps a decimal comma, so export it with decimal points" * ("," in str(error))
-        raise damage_error(path, f"it has text where a number should be ({_short(error)}){comma}") from error
+        raise damage_error(path, f"it has text where a number should be ({_shorten(error)}){comma}") from error
 
 
 def ints(tokens: Iterable[bytes], path: Path) -> IndexArray:
     """Return `tokens` as a flat int64 array.
 
     Raises:
-        FileFormatError: one of them is not a whole number, or is too large for 64 bits.
+        FileFormatError: a word is not an integer, or is too large for 64 bits.
     """
     try:
         return np.fromiter(map(int, tokens), dtype=np.int64)
     except (ValueError, OverflowError) as error:
-        raise damage_error(path, f"it has no whole number where one should be ({_short(error)})") from error
+        raise damage_error(path, f"it has text where an integer should be ({_shorten(error)})") from error
 
 
-def _short(error: Exception) -> str:
+def _shorten(error: Exception) -> str:
     return " ".join(str(error).rstrip(".").split())[:80]
 
 
@@ -239,7 +239,7 @@ def fan_triangles(counts: npt.ArrayLike, corners: npt.ArrayLike) -> IndexArray:
     """Cut polygons into fans of triangles around their first corners, in order.
 
     Args:
-        counts: (P,) number of corners of each polygon; those below 3 give no triangle.
+        counts: (P,) number of corners of each polygon; polygons with fewer than 3 corners yield no triangle.
         corners: (sum of counts,) the corners of all polygons, one after another.
 
     Returns:
@@ -258,7 +258,7 @@ def fan_triangles(counts: npt.ArrayLike, corners: npt.ArrayLike) -> IndexArray:
     starts = np.cumsum(sizes) - sizes
     fans = np.maximum(sizes - 2, 0)
     first = np.repeat(starts, fans)
-    # The second corner of a triangle is one past the first of its polygon, and one more for each before it there.
+    # The second corner of triangle k of a polygon is at k + 1 after the first corner of the polygon.
     corner = np.arange(1, len(first) + 1, dtype=np.int64)
     corner += np.repeat(starts - (np.cumsum(fans) - fans), fans)
     out = np.empty((len(first), 3), dtype=np.int64)
@@ -269,7 +269,7 @@ def fan_triangles(counts: npt.ArrayLike, corners: npt.ArrayLike) -> IndexArray:
 
 
 def strip_triangles(counts: npt.ArrayLike, corners: npt.ArrayLike) -> IndexArray:
-    """Cut triangle strips into triangles, (F, 3) int64; every second one is turned so that all wind alike.
+    """Split triangle strips into triangles (F, 3) int64; every second triangle is flipped for a consistent orientation.
 
     Args:
         counts: (P,) number of corners of each strip.
@@ -320,10 +320,10 @@ def mesh_of(
 
 
 def bytes_of_colours(values: npt.NDArray[Any]) -> ByteArray | None:
-    """Return (V, 3) uint8 of colours as files have them; None where they are none, which no surface is refused for.
+    """Return (V, 3) uint8 from the colours of a file, or None if they are invalid; a mesh may have no colours.
 
     Args:
-        values: (V, 3) uint8, or other numbers that run up to 1, to 255 or to 65535.
+        values: (V, 3) uint8, or other numbers up to 1, 255 or 65535.
     """
     if values.dtype == np.uint8:
         return values
@@ -335,7 +335,7 @@ def bytes_of_colours(values: npt.NDArray[Any]) -> ByteArray | None:
 
 
 def colours_of_words(rows: Sequence[Sequence[bytes]], first: int, path: Path) -> FloatArray | None:
-    """Return the three numbers from word `first` of each row, (n, 3); None where some row has none."""
+    """Return the three numbers from word `first` of each row, (n, 3), or None if a row lacks them."""
     try:
         columns = chain.from_iterable(words[first : first + 3] for words in rows)
         return floats(columns, path).reshape(-1, 3) if min(map(len, rows)) >= first + 3 else None
@@ -344,7 +344,7 @@ def colours_of_words(rows: Sequence[Sequence[bytes]], first: int, path: Path) ->
 
 
 def joined_colours(parts: Sequence[npt.NDArray[Any] | None]) -> ByteArray | None:
-    """Return the colours of all parts (V, 3), as `bytes_of_colours` does; None where one part has none."""
+    """Return the colours of all parts (V, 3), see `bytes_of_colours`; None if a part has no colours."""
     known = [part for part in parts if part is not None]
     return bytes_of_colours(np.concatenate(known)) if known and len(known) == len(parts) else None
 
@@ -359,7 +359,7 @@ def number_lines(values: npt.NDArray[Any], pattern: str) -> str:
 _BARE_DOCTYPE = re.compile(rb"<!DOCTYPE\s+[\w:.-]{1,80}\s*>")
 
 
-class _Plain(ET.TreeBuilder):
+class _LimitedTreeBuilder(ET.TreeBuilder):
     elements = 0
 
     def start(self, tag: str, attrs: dict[str, str], /) -> ET.Element:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -373,47 +373,47 @@ class _Plain(ET.TreeBuilder):
 
 
 def xml_root(data: bytes, path: Path) -> ET.Element:
-    """Parse XML from a stranger: document types that declare anything, and with them entities, are refused.
+    """Parse untrusted XML; document types with declarations, and therefore entities, are rejected.
 
     Raises:
         FileFormatError: it is not well-formed XML, or its document type is more than a name.
     """
     # MeshLab starts its files with a bare <!DOCTYPE name>, which declares nothing.
     data = _BARE_DOCTYPE.sub(b"", data, count=1)
-    parser = ET.XMLParser(target=_Plain())
+    parser = ET.XMLParser(target=_LimitedTreeBuilder())
     try:
         parser.feed(data)
         return parser.close()
     except ET.ParseError as error:
-        raise damage_error(path, f"it is not well-formed XML ({_short(error)})") from error
+        raise damage_error(path, f"it is not well-formed XML ({_shorten(error)})") from error
     except (ValueError, LookupError) as error:
-        raise damage_error(path, _short(error)) from error
+        raise damage_error(path, _shorten(error)) from error
 
 
 def json_value(data: bytes, path: Path) -> Any:
-    """Parse JSON from a stranger.
+    """Parse untrusted JSON.
 
     Raises:
-        FileFormatError: it is not JSON, or is nested too deep.
+        FileFormatError: it is not JSON, or is nested too deeply.
     """
     try:
         return json.loads(data.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
-        raise damage_error(path, f"it is not valid JSON ({_short(error)})") from error
+        raise damage_error(path, f"it is not valid JSON ({_shorten(error)})") from error
 
 
 def check_count(declared: int, bytes_each: int, available: int, item_name: str, path: Path) -> None:
-    """Refuse a header that declares more than the file can hold, before anything is allocated for it.
+    """Check that a file is large enough for the items that its header declares, before they are allocated.
 
     Args:
-        declared: how many the header declares.
-        bytes_each: the least that each takes in the file.
-        available: the bytes that are there.
-        item_name: "vertices", "faces": used in the sentence.
-        path: the file.
+        declared: number of items that the header declares.
+        bytes_each: smallest size of an item in the file, bytes.
+        available: number of bytes in the file for these items.
+        item_name: plural noun of the items for the message, such as "vertices" or "faces".
+        path: path of the file, used in messages.
 
     Raises:
-        FileFormatError: there are too many of them, or fewer than none.
+        FileFormatError: the declared number is too large or negative.
     """
     if declared < 0:
         raise damage_error(path, f"its header declares {declared} {item_name}")

@@ -1,7 +1,7 @@
 """Limits on the size and memory of files that the readers of meshes and landmarks accept.
 
-Readers go through each byte once, so that time and memory grow with the file. Where a format lets one piece of a file
-be used again and again, or unpacks it, an `Allowance` stops the file that is small and makes much.
+Readers process each byte once, so that time and memory are proportional to the size of the file. If a format can refer
+to the same bytes repeatedly, or compresses them, an `Allowance` rejects small files that expand to large arrays.
 """
 
 from __future__ import annotations
@@ -11,30 +11,30 @@ from pathlib import Path
 from shapespace.errors import FileFormatError
 
 LARGEST_MESH_FILE_BYTES = 2**30
-"""Mesh files longer than this are not read (1 GiB), with the buffers that a glTF file names."""
+"""Largest size of a mesh file, including the buffers of a glTF file (1 GiB)."""
 
 LARGEST_LANDMARK_FILE_BYTES = 2**23
-"""Landmark files longer than this are not read (8 MiB)."""
+"""Largest size of a landmark file (8 MiB)."""
 
 LARGEST_CONFIGURATIONS_FILE_BYTES = 2**27
-"""Longer files with the landmarks of many specimens are not read (128 MiB), nor R files that unpack to more."""
+"""Largest size of a file with the landmarks of many specimens, and of an unpacked R file (128 MiB)."""
 
 MOST_PARTS = 50_000
-"""Most nodes, shapes, pieces, sections and blocks in one file: each costs some microseconds, however small it is."""
+"""Largest number of nodes, shapes, pieces, sections and blocks in a file; each takes some microseconds."""
 
 GROWTH = 32
-"""Bytes of arrays that a reader may make for each byte of a file that can use its bytes more than once."""
+"""Bytes of arrays that a reader may allocate per byte of a file whose bytes can be used more than once."""
 
 SPARE_BYTES = 2**26
-"""Bytes of arrays that it may make besides, for small files (64 MiB)."""
+"""Bytes of arrays that a reader may allocate in addition, for small files (64 MiB)."""
 
 
 class Allowance:
     """Remaining memory that data from one file may use.
 
     Args:
-        file_bytes: how long the file is; buffers beside it are added by `more_file`.
-        path: for messages.
+        file_bytes: size of the file, bytes; `more_file` adds the sizes of its external buffers.
+        path: path of the file, used in messages.
     """
 
     def __init__(self, file_bytes: int, path: Path) -> None:
@@ -49,15 +49,15 @@ class Allowance:
         self._bytes += GROWTH * file_bytes
 
     def take(self, count: int, bytes_each: int) -> None:
-        """Count arrays of `count` numbers before they are made.
+        """Subtract an array of `count` numbers from the remaining memory, before it is allocated.
 
         Raises:
-            FileFormatError: they are out of proportion to the file.
+            FileFormatError: the arrays are too large in proportion to the file.
         """
         self._bytes -= count * bytes_each
         if self._bytes < 0:
             raise FileFormatError(
-                f"Cannot read {self.path}: its {self.file_bytes} bytes unfold to more than {GROWTH} times as much and "
+                f"Cannot read {self.path}: its {self.file_bytes} bytes expand to more than {GROWTH} times as much plus "
                 f"{SPARE_BYTES >> 20} MiB, so it is damaged or made to fill the memory; export it again as plain "
                 "triangles, without copies."
             )

@@ -13,8 +13,8 @@ from typing import Any
 from shapespace.errors import FileError, InputError, ShapespaceError
 
 TRIES = 3
-"""Times that a download is tried."""
-_WAIT_S = 0.5  # seconds; doubled at each try
+"""Number of attempts to download a file."""
+_WAIT_S = 0.5  # seconds; doubled at each attempt
 _PIECE = 1 << 20  # bytes (1 MiB)
 _GLOB = frozenset("*?[")
 
@@ -25,7 +25,7 @@ def is_address(text: str) -> bool:
 
 
 def name_of(address: str) -> str:
-    """Return the name of the file at an address, of an archive that of the file in it."""
+    """Return the name of the file at an address; in an archive, that of the file inside."""
     inside = address.split("::", 1)[0].split("://", 1)[1]
     return PurePosixPath(inside.partition("?")[0]).name
 
@@ -35,13 +35,13 @@ def addresses(address: str, endings: Sequence[str], *, recursive: bool) -> list[
 
     Args:
         address: a file, a folder, or a pattern with * or ?.
-        endings: of the files that are taken from patterns and folders, in small letters.
-        recursive: whether to take those in folders below too.
+        endings: endings of the files to select from patterns and folders, in lower case.
+        recursive: whether to include files in subfolders.
 
     Raises:
-        InputError: there are none.
-        FileError: the place cannot be reached.
-        ShapespaceError: what reads such addresses is not installed.
+        InputError: there are no such files.
+        FileError: the address cannot be reached.
+        ShapespaceError: the package that reads such addresses is not installed.
     """
     with _translate_errors(address):
         files, path = _files(address)
@@ -56,7 +56,7 @@ def addresses(address: str, endings: Sequence[str], *, recursive: bool) -> list[
         full_addresses = [f"{scheme}://{str(item).removeprefix(f'{scheme}://')}{sep}{chain}" for item in sorted(paths)]
     readable = [item for item in full_addresses if name_of(item).lower().endswith(tuple(endings))]
     if not readable:
-        raise InputError(f"{address} holds no meshes; shapespace reads {', '.join(endings)}.")
+        raise InputError(f"{address} contains no meshes; shapespace reads {', '.join(endings)}.")
     return readable
 
 
@@ -65,7 +65,7 @@ def version_of(address: str) -> str:
 
     Raises:
         FileError: it cannot be reached.
-        ShapespaceError: what reads such addresses is not installed.
+        ShapespaceError: the package that reads such addresses is not installed.
     """
     with _translate_errors(address):
         files, path = _files(address)
@@ -74,11 +74,12 @@ def version_of(address: str) -> str:
 
 @contextlib.contextmanager
 def fetch_copy(address: str, most_bytes: int) -> Generator[Path]:
-    """Yield a copy of the file at an address, of the same name, which is there during the block.
+    """Yield the path of a temporary copy of the file at an address; it keeps the name and is removed after the block.
 
     Raises:
-        FileError: it cannot be had, after some tries, or is larger than `most_bytes`.
-        ShapespaceError: what reads such addresses is not installed.
+        FileError: it cannot be downloaded after `TRIES` attempts.
+        InputError: it is larger than `most_bytes`.
+        ShapespaceError: the package that reads such addresses is not installed.
     """
     with tempfile.TemporaryDirectory(prefix="shapespace-") as folder:
         file = Path(folder) / name_of(address)
@@ -101,7 +102,9 @@ def _copy(address: str, file: Path, most_bytes: int) -> None:
             while piece := source.read(_PIECE):
                 count += len(piece)
                 if count > most_bytes:
-                    raise InputError(f"{address} is larger than {most_bytes:,} bytes; thin the scan, as by MeshLab.")
+                    raise InputError(
+                        f"{address} is larger than {most_bytes:,} bytes; decimate the scan, for example with MeshLab."
+                    )
                 copy.write(piece)
 
 
@@ -114,7 +117,7 @@ def _files(address: str) -> tuple[Any, str]:
 
 @contextlib.contextmanager
 def _translate_errors(address: str) -> Generator[None]:
-    """Convert exceptions of fsspec and the libraries below it to one error message."""
+    """Convert exceptions of fsspec and its backends to one error message."""
     try:
         yield
     except ShapespaceError:

@@ -1,8 +1,8 @@
 """HDF5 and MATLAB files and pickles from other tools, read by a library in a sandboxed process.
 
-Those libraries take what memory a file asks for, follow links to other files, and hang or crash in damaged structures.
-In that process they see one open file and can open no other, are held to a share of memory and time, and only numbers
-and texts come back, in proportion to the size of the file.
+These libraries allocate as much memory as a file declares, follow links to other files, and hang or crash in damaged
+structures. In the sandboxed process they have one open file and cannot open others, their memory and time are limited,
+and they return only numbers and texts, in proportion to the size of the file.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from shapespace.io import sandbox_child
 from shapespace.io.files import open_file
 
 MOST_BYTES: Final = 2**32
-"""Bytes that all arrays of one file may have, however large it is (4 GiB)."""
+"""Limit of the total size of the arrays of a file of any size (4 GiB)."""
 GROWTH: Final = 8
-"""Bytes of arrays for each byte of the file, since they may be packed in it."""
+"""Bytes of arrays per byte of the file, which may be compressed."""
 SPARE_BYTES: Final = 2**26
-"""Bytes of arrays besides, for small files (64 MiB)."""
+"""Bytes of arrays in addition, for small files (64 MiB)."""
 PROGRAM_BYTES: Final = 2**30
-"""Memory of the process besides three times the arrays: Python and the libraries (1 GiB)."""
+"""Memory of the process in addition to three times the arrays: Python and the libraries (1 GiB)."""
 MOST_SECONDS: Final = 60
-"""Time that the process has, and a second more for each `BYTES_A_SECOND` of the file."""
+"""Time limit of the process, plus one second for each `BYTES_A_SECOND` of the file."""
 BYTES_A_SECOND: Final = 2**22  # 4 MiB; far below the reading speed of a disk
 
 HDF5_SIGNATURE: Final = b"\x89HDF\r\n\x1a\n"
@@ -46,10 +46,10 @@ class Tree:
     """Content of an HDF5 file, or of a file with the same structure, by path: "/model/mean".
 
     Args:
-        arrays: of numbers.
-        texts: single ones.
-        attributes: numbers and texts by name, of groups and arrays that have any.
-        groups: paths of all groups, with "/", and of what was left.
+        arrays: path -> array of numbers.
+        texts: path -> text, for single texts.
+        attributes: path -> numbers and texts by name, for groups and arrays with attributes.
+        groups: paths of all groups, including "/", and of the objects that were not read.
     """
 
     arrays: Mapping[str, npt.NDArray[Any]]
@@ -59,31 +59,31 @@ class Tree:
 
 
 def read_hdf5_sandboxed(path: Path, leave: Sequence[str] = ()) -> Tree:
-    """Return the content of an HDF5 file, without the paths in `leave` and objects of other kinds.
+    """Return the content of an HDF5 file, without the paths in `leave` and without objects of unsupported types.
 
     Raises:
         FileError: it cannot be read.
-        SandboxError: The file is damaged, reaches outside itself, or unfolds to far more than its size.
+        SandboxError: the file is damaged, links to other files, or expands to far more than its size.
     """
     return _read(path, {"kind": "hdf5", "leave": list(leave)})
 
 
 def read_matlab_sandboxed(path: Path, variables: Sequence[str]) -> Tree:
-    """Return the variables `variables` of a MATLAB file of version 4 to 7, structures as groups, those that are there.
+    """Return those of `variables` that a MATLAB file of version 4 to 7 contains, structures as groups.
 
     Raises:
         FileError: it cannot be read.
-        SandboxError: See `read_hdf5_sandboxed`.
+        SandboxError: see `read_hdf5_sandboxed`.
     """
     return _read(path, {"kind": "matlab", "wanted": list(variables)})
 
 
 def read_pickle_sandboxed(path: Path, names: Sequence[str]) -> Tree:
-    """Return the arrays `names` of the dictionary in a pickle, those that are there; nothing in it is called.
+    """Return those arrays of `names` that the dictionary in a pickle contains; no code of the pickle is called.
 
     Raises:
         FileError: it cannot be read.
-        SandboxError: It is damaged, or names what no array needs.
+        SandboxError: it is damaged, or refers to objects that no array needs.
     """
     return _read(path, {"kind": "pickle", "wanted": list(names)})
 
@@ -98,13 +98,13 @@ def _read(path: Path, request: dict[str, Any]) -> Tree:
             "most_memory": PROGRAM_BYTES + 3 * most_bytes,
             "most_seconds": seconds,
         }
-        # A program of its own and not a copy: a copy of a process with threads may hang, and a script without a guard
-        # would be run again. -P, since modules beside the program are none of its own.
+        # A separate program, not multiprocessing: a fork of a process with threads may hang, and spawn would run a
+        # script without a main guard again. -P excludes the folder of the program from the module search path.
         command = [sys.executable, "-P", str(Path(sandbox_child.__file__)), json.dumps(request)]
         environment = os.environ | {
-            "PYTHONPATH": os.pathsep.join(entry for entry in sys.path if entry),  # not the folder that one stands in
+            "PYTHONPATH": os.pathsep.join(entry for entry in sys.path if entry),  # without the current folder
             "OPENBLAS_NUM_THREADS": "1",
-            "HDF5_PLUGIN_PRELOAD": "::",  # no code of filters from elsewhere
+            "HDF5_PLUGIN_PRELOAD": "::",  # no filter plugins, which would be foreign code
         }
         try:
             completed = subprocess.run(
@@ -114,14 +114,14 @@ def _read(path: Path, request: dict[str, Any]) -> Tree:
         except subprocess.TimeoutExpired as error:
             raise SandboxError(f"reading it takes longer than {seconds} s") from error
         except OSError as error:
-            raise SandboxError(f"the system does not let a process start that reads it ({error.strerror})") from error
+            raise SandboxError(f"the system cannot start the process that reads it ({error.strerror})") from error
     return _tree(completed.stdout)
 
 
 def _tree(output: bytes) -> Tree:
     head, newline, _ = output.partition(b"\n") if len(output) < 2**16 else (output[: output.find(b"\n")], b"\n", b"")
     if not newline or not head:
-        raise SandboxError("the library that reads it does not survive it")
+        raise SandboxError("the library that reads it crashes")
     header = json.loads(head)
     if "wrong" in header:
         raise SandboxError(header["wrong"])
@@ -131,7 +131,7 @@ def _tree(output: bytes) -> Tree:
         dtype = np.dtype(kind)
         count = int(np.prod(shape, dtype=np.int64))
         if offset + count * dtype.itemsize > len(output):
-            raise SandboxError("the library that reads it does not survive it")
+            raise SandboxError("the library that reads it crashes")
         arrays[path] = np.frombuffer(output, dtype, count, offset).reshape(shape)
         offset += count * dtype.itemsize
     return Tree(arrays, header["texts"], header["attributes"], tuple(header["groups"]))

@@ -1,6 +1,7 @@
-"""Program of the sandbox process, which imports nothing of shapespace.
+"""Program of the sandbox process, which does not import shapespace.
 
-Its standard input is the file. It writes one line of JSON on what it found and, after it, the bytes of the arrays.
+Its standard input is the file. Its output is one line of JSON that describes the content, followed by the bytes of the
+arrays.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ _MOST_AXES = 8  # of one array
 _LONGEST_TEXT = 2**20  # bytes (1 MiB)
 _LONGEST_NAME = 1024  # characters
 _FILTERS = {1, 2, 3}
-"""Deflate, shuffle and checksums: those that HDF5 itself brings, and that models use."""
+"""HDF5 filters deflate, shuffle and Fletcher-32 checksum, which are part of HDF5 and which models use."""
 _NUMBERS: Final = "biuf"
 _DEEPEST_CHUMPY = 8  # nested chumpy objects
 _MOST_STEPS = 400_000  # opcodes of a pickle; limit on time
@@ -43,12 +44,12 @@ _ARRAY_NAMES: Final = {
         for module in ("", "_")
     },
 }
-"""Names of what arrays in pickles are made of; `_Noted` objects stand for them, and what they name is never called."""
+"""Classes and functions that pickles use for arrays; `_PickledObject` replaces them, so that they are never called."""
 _CHUMPY = re.compile(r"chumpy(\.\w+)*")
 _DTYPE = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248])")
 
 
-class _RefusedError(ValueError):
+class _RejectedFileError(ValueError):
     """The file uses a feature that no model needs; the text names it, as a clause."""
 
 
@@ -66,7 +67,9 @@ class _FileContent:
         """Subtract `count` bytes from the memory allowed, before they are allocated."""
         self._left -= count
         if self._left < 0:
-            raise _RefusedError(f"{path} unfolds to more than {self._most >> 20} MiB, out of proportion to the file")
+            raise _RejectedFileError(
+                f"{path} expands to more than {self._most >> 20} MiB, out of proportion to the size of the file"
+            )
 
     def add(self, path: str, array: npt.NDArray[Any]) -> None:
         self.arrays[path] = np.asarray(array, array.dtype.newbyteorder("<"), order="C")
@@ -93,16 +96,16 @@ def _walk(group: Any, path: str, content: _FileContent, leave: tuple[str, ...]) 
     content.groups.append(path or "/")
     _attributes(group, path or "/", content)
     if path.count("/") > _DEEPEST or len(content.groups) + len(content.arrays) + len(group) > _MOST_NODES:
-        raise _RefusedError("it has more groups than a model")
+        raise _RejectedFileError("it has more groups than any model")
     for name in group:
         if len(name) > _LONGEST_NAME:
-            raise _RefusedError("it has longer names than a model")
+            raise _RejectedFileError("it has longer names than any model")
         inner = f"{path}/{name}"
         if inner in leave:
             content.groups.append(inner)
             continue
         if group.get(name, getclass=True, getlink=True) is not h5py.HardLink:
-            raise _RefusedError(f"{inner} is a link to elsewhere")
+            raise _RejectedFileError(f"{inner} is a link to elsewhere")
         item = group[name]
         if isinstance(item, h5py.Group):
             _walk(item, inner, content, leave)
@@ -115,7 +118,7 @@ def _attributes(item: Any, path: str, content: _FileContent) -> None:
 
     values: dict[str, Any] = {}
     if len(item.attrs) > _MOST_ATTRIBUTES:
-        raise _RefusedError(f"{path} has more attributes than one of a model")
+        raise _RejectedFileError(f"{path} has more attributes than any part of a model")
     for name in item.attrs:
         identifier = item.attrs.get_id(name)
         is_text = h5py.check_string_dtype(identifier.dtype) is not None
@@ -135,12 +138,12 @@ def _dataset(dataset: Any, path: str, content: _FileContent) -> None:
     h5py: Any = library
     stored = dataset.id.get_create_plist()
     if stored.get_external_count() or stored.get_layout() == h5py.h5d.VIRTUAL:
-        raise _RefusedError(f"{path} lies in another file")
+        raise _RejectedFileError(f"{path} is stored in another file")
     if dataset.shape is None or len(dataset.shape) > _MOST_AXES:
         return
     used = {stored.get_filter(index)[0] for index in range(stored.get_nfilters())}
     if not used <= _FILTERS:
-        raise _RefusedError(f"{path} is packed in a way that no model needs")
+        raise _RejectedFileError(f"{path} is compressed in a way that no model needs")
     count, item_bytes = math.prod(dataset.shape), dataset.dtype.itemsize
     of_text = h5py.check_string_dtype(dataset.dtype)
     if of_text is None and dataset.dtype.kind not in _NUMBERS:
@@ -192,8 +195,8 @@ def _add_variable(value: Any, path: str, content: _FileContent) -> None:
             _add_variable(value.reshape(-1)[0][name], f"{path}/{name}", content)
 
 
-class _Noted:
-    """An object that a pickle would create: its arguments, and its state."""
+class _PickledObject:
+    """Arguments and state of an object that a pickle would create."""
 
     kind = ""
     arguments: tuple[Any, ...] = ()
@@ -207,28 +210,28 @@ class _Noted:
 
 
 class _Unpickler(pickle.Unpickler):
-    """An unpickler of numbers, texts, lists, dictionaries and what arrays are made of."""
+    """An unpickler of numbers, texts, lists, dictionaries and the parts of arrays."""
 
     def find_class(self, module: str, name: str, /) -> Any:
         if module in ("copy_reg", "copyreg") and name == "_reconstructor":
-            return _create_noted
+            return _create_pickled_object
         if (module, name) == ("_codecs", "encode"):
             return _latin_bytes
         kind = "chumpy" if _CHUMPY.fullmatch(module) and name.isidentifier() else _ARRAY_NAMES.get((module, name))
         if kind is None:
-            raise _RefusedError(f"it asks for {module[:40]}.{name[:40]}, which no array needs")
-        return type(kind, (_Noted,), {"kind": kind})
+            raise _RejectedFileError(f"it asks for {module[:40]}.{name[:40]}, which no array needs")
+        return type(kind, (_PickledObject,), {"kind": kind})
 
 
-def _create_noted(kind: Any, *_: Any) -> _Noted:
-    if not (isinstance(kind, type) and issubclass(kind, _Noted)):
-        raise _RefusedError("it calls what is no name")
+def _create_pickled_object(kind: Any, *_: Any) -> _PickledObject:
+    if not (isinstance(kind, type) and issubclass(kind, _PickledObject)):
+        raise _RejectedFileError("it calls an object that is not a class")
     return kind()
 
 
 def _latin_bytes(text: str, encoding: str) -> bytes:
     if encoding not in ("latin1", "latin-1"):
-        raise _RefusedError("it asks for a strange text")
+        raise _RejectedFileError("it asks for an unsupported text encoding")
     return text.encode("latin-1", "replace")
 
 
@@ -237,16 +240,16 @@ def _pickle(stream: BinaryIO, request: dict[str, Any], content: _FileContent) ->
     _forbid_opening_files()
     try:
         for step, (opcode, argument, _) in enumerate(pickletools.genops(data)):
-            # A place in the memo beyond the length of the file would only fill the memory.
+            # An index in the memo beyond the length of the file would only fill the memory.
             if step > _MOST_STEPS or (opcode.name.endswith("PUT") and (argument or 0) > len(data)):
-                raise _RefusedError(f"it has more than {_MOST_STEPS} steps, or remembers more than it holds")
+                raise _RejectedFileError(f"it has more than {_MOST_STEPS} steps, or an invalid memo index")
         values = _Unpickler(io.BytesIO(data), encoding="latin-1").load()
-    except (_RefusedError, MemoryError):
+    except (_RejectedFileError, MemoryError):
         raise
-    except Exception as error:  # pickles may raise anything at all
-        raise _RefusedError("it is no pickle of arrays, or it is cut short") from error
+    except Exception as error:  # pickles may raise any exception
+        raise _RejectedFileError("it is not a pickle of arrays, or it is cut short") from error
     if type(values) is not dict:
-        raise _RefusedError("it holds no dictionary")
+        raise _RejectedFileError("it does not contain a dictionary")
     for name in request["wanted"]:
         if name in values:
             array = _pickled_array(values[name])
@@ -258,8 +261,8 @@ def _pickled_array(value: Any, depth: int = 0) -> npt.NDArray[Any]:
     """Return the array that `value` of a pickle describes, also inside chumpy."""
     if isinstance(value, list) and set(map(type, cast(list[object], value))) <= {int, float}:
         return np.array(value, dtype=np.float64)
-    if not isinstance(value, _Noted) or depth > _DEEPEST_CHUMPY:
-        raise _RefusedError("what should be an array is none")
+    if not isinstance(value, _PickledObject) or depth > _DEEPEST_CHUMPY:
+        raise _RejectedFileError("an entry that should be an array is none")
     match value.kind, value.state, value.arguments:
         case "array", (_, shape, dtype, fortran, data), _:
             return _numbers(data, dtype, shape, bool(fortran))
@@ -273,17 +276,17 @@ def _pickled_array(value: Any, depth: int = 0) -> npt.NDArray[Any]:
             flat = _pickled_array(inner, depth + 1).ravel()
             chosen = _pickled_array(indices, depth + 1).astype(np.int64).ravel()
             if chosen.size and (chosen.min() < 0 or chosen.max() >= len(flat)):
-                raise _RefusedError("it takes parts of an array that are not there")
+                raise _RejectedFileError("it selects elements beyond the end of an array")
             return flat[chosen].reshape(_shape(others.get("preferred_shape") or (len(chosen),), len(chosen)))
         case _:
-            raise _RefusedError("what should be an array is none")
+            raise _RejectedFileError("an entry that should be an array is none")
 
 
 def _numbers(data: Any, described: Any, shape: Any, fortran: bool) -> npt.NDArray[Any]:
-    kind = described.arguments[0] if isinstance(described, _Noted) and described.arguments else None
+    kind = described.arguments[0] if isinstance(described, _PickledObject) and described.arguments else None
     match = _DTYPE.fullmatch(kind) if isinstance(kind, str) else None
     if match is None:
-        raise _RefusedError("an array in it is not of numbers")
+        raise _RejectedFileError("an array in it does not consist of numbers")
     is_big = described.arguments[0][:1] == ">" or (
         isinstance(described.state, tuple) and described.state[1:2] == (">",)
     )
@@ -291,9 +294,9 @@ def _numbers(data: Any, described: Any, shape: Any, fortran: bool) -> npt.NDArra
     if isinstance(data, str):  # as Python 2 wrote bytes
         data = data.encode("latin-1", "replace")
     if not isinstance(data, bytes | bytearray):
-        raise _RefusedError("an array in it holds objects")
+        raise _RejectedFileError("an array in it contains objects")
     if len(data) % dtype.itemsize:
-        raise _RefusedError("an array in it is not as long as it says")
+        raise _RejectedFileError("an array in it does not have the declared length")
     sizes = _shape(shape, len(data) // dtype.itemsize)
     return np.frombuffer(data, dtype).reshape(sizes, order="F" if fortran else "C")
 
@@ -301,9 +304,9 @@ def _numbers(data: Any, described: Any, shape: Any, fortran: bool) -> npt.NDArra
 def _shape(shape: Any, count: int) -> tuple[int, ...]:
     sizes = tuple(shape) if type(shape) in (tuple, list) else (-1,)
     if len(sizes) > _MOST_AXES or not all(type(size) is int and 0 <= size < 2**40 for size in sizes):
-        raise _RefusedError("an array in it has a strange shape")
+        raise _RejectedFileError("an array in it has an invalid shape")
     if math.prod(sizes) != count:
-        raise _RefusedError("an array in it is not as long as it says")
+        raise _RejectedFileError("an array in it does not have the declared length")
     return sizes
 
 
@@ -318,7 +321,7 @@ def _forbid_opening_files() -> None:
             "raw-unicode-escape",
             "utf-8",
             "utf-16",
-        ):  # which are files too, opened when first used
+        ):  # codecs are loaded from files at their first use
             codecs.lookup(name)
         resource.setrlimit(resource.RLIMIT_NOFILE, (3, 3))
 
@@ -340,7 +343,7 @@ def _main() -> None:
     content, out = _FileContent(request["most_bytes"]), sys.stdout.buffer
     try:
         {"hdf5": _hdf5, "matlab": _matlab, "pickle": _pickle}[request["kind"]](sys.stdin.buffer, request, content)
-    except _RefusedError as error:
+    except _RejectedFileError as error:
         out.write(json.dumps({"wrong": str(error)}).encode() + b"\n")
     except MemoryError:
         out.write(json.dumps({"wrong": "it asks for more memory than such a file can"}).encode() + b"\n")

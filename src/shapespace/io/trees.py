@@ -36,8 +36,8 @@ class Tree:
         parents: (M,) parent of each node, -1 for the root. Nodes 0 to T - 1 are the tips in the order of `tips`, node T
             is the root, and each internal node comes after its parent.
         lengths: (M,) length of the branch above each node, in the unit of the file; 0 for the root.
-        where: what the tree is called in messages.
-        notes: a sentence each on what was left out or is unusual.
+        where: name of the tree in messages.
+        notes: sentences about omitted or unusual parts of the tree.
 
     Example:
         >>> ss.io.Tree(tips=("a", "b"), parents=np.array([2, 2, -1]), lengths=np.array([1.0, 1.0, 0.0])).tips
@@ -91,13 +91,13 @@ class Tree:
         if absent:
             raise InputError(
                 f"{self.where} has no tip for {len(absent)} of {len(names)} shapes ({first_names(absent, _NAMED)}); "
-                f"name shapes as tips ({first_names(self.tips, 2)}), or leave these shapes out."
+                f"name shapes as tips ({first_names(self.tips, 2)}), or exclude these shapes."
             )
         kept, count = [index[_key(name)] for name in names], len(self.tips)
         if len(set(kept)) < len(kept) or not 3 <= len(kept) <= _MOST_SPECIES:
             raise InputError(
-                f"{self.where}: {len(names)} shapes are of {len(set(kept))} tips; an analysis on a tree needs one "
-                f"shape for each tip, and 3 to {_MOST_SPECIES:,} of them."
+                f"{self.where}: {len(names)} shapes belong to {len(set(kept))} tips; an analysis on a tree needs one "
+                f"shape for each tip, and 3 to {_MOST_SPECIES:,} shapes."
             )
         used, branches = np.isin(np.arange(len(self.parents)), kept), np.zeros(len(self.parents), dtype=np.intp)
         for node in [*range(count), *range(len(self.parents) - 1, count, -1)]:
@@ -115,12 +115,12 @@ class Tree:
         depths = np.diagonal(tree.covariance)
         distances = depths[:, None] + depths - 2 * tree.covariance
         np.fill_diagonal(distances, depths)
-        one, other = (int(k) for k in np.unravel_index(distances.argmin(), distances.shape))
-        if distances[one, other] <= _NO_DISTANCE * depths.max():
-            ends = f"{names[one]} and {names[other] if one != other else 'the root'}"
+        first, second = (int(k) for k in np.unravel_index(distances.argmin(), distances.shape))
+        if distances[first, second] <= _NO_DISTANCE * depths.max():
+            ends = f"{names[first]} and {names[second] if first != second else 'the root'}"
             raise InputError(
                 f"{self.where}: the distance between {ends} is 0, so the covariance of the species is singular; give "
-                "their branches lengths above 0, or leave one of them out."
+                "their branches lengths above 0, or exclude one of the species."
             )
         notes = list(self.notes)
         if len(kept) < count:
@@ -155,7 +155,7 @@ def read_tree(path: Path | str) -> Tree:
         schema = "nexus" if text.lstrip()[:6].lower() == "#nexus" else "newick"
         trees = iter(dendropy.Tree.yield_from_files([io.StringIO(text)], schema, preserve_underscores=True))
         found, has_more = next(trees, None), next(trees, None) is not None
-    # The parser raises what it likes on what it cannot read; deep nesting is a RecursionError.
+    # The parser may raise any exception on invalid input; deep nesting is a RecursionError.
     except Exception as error:
         # The first sentence, without an explanation after a colon that is too long.
         reason = " ".join(str(error).split()).split(". ")[0].rstrip(".")

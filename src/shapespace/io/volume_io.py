@@ -1,10 +1,10 @@
 """Readers of label volumes: NIfTI (`.nii`, `.nii.gz`), NRRD (`.nrrd`, header and data in one file) and MetaImage
 (`.mha`, `.mhd`), as RAS millimetres.
 
-nibabel and pynrrd read the headers of NIfTI and NRRD; the voxels are decoded here, so that a header that declares more
-than its file holds, a volume that takes more memory than allowed, and a compressed stream that grows without end are
-refused before memory is taken. Voxels are decompressed and converted in pieces of 1 MiB, up to the declared size and no
-further. No other file is opened, except the data file of `.mhd` in the same folder.
+nibabel and pynrrd read the headers of NIfTI and NRRD. The voxels are decoded in this module, so that the following are
+rejected before memory is allocated: a header that declares more voxels than its file contains, a volume that takes more
+memory than allowed, and a compressed stream that expands without end. Voxels are decompressed and converted in pieces
+of 1 MiB, up to the declared size. No other file is opened, except the data file of `.mhd` in the same folder.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ from shapespace.io.parsing import CUT_SHORT, damage_error
 from shapespace.types import MAX_MEMORY_BYTES, FloatArray, LabelVolume, Segment
 
 VOLUME_ENDINGS = (".nii", ".nii.gz", ".nrrd", ".mha", ".mhd")
-"""The endings that `read_volume` takes."""
+"""File name endings that `read_volume` accepts."""
 
 _MOST_BYTES = 1 << 31  # 2 GiB
 _MOST_HEADER = 1 << 20  # 1 MiB
 _PIECE = 1 << 20  # bytes (1 MiB)
 _WORK_BYTES = 1 << 26
-"""Memory of reading besides the labels: libraries, and pieces of 1 MiB as float64 (64 MiB, measured 40)."""
-# No deflate stream grows by more than 1032 to 1.
+"""Memory for reading in addition to the labels: libraries, and pieces of 1 MiB as float64 (64 MiB; measured: 40)."""
+# A deflate stream expands by a factor of at most 1032.
 _DEFLATE_GROWTH = 1032
 _BZIP2_SPARE, _BZIP2_GROWTH = 1 << 28, 10_000
-"""bzip2 packs zeros almost without bound. Volumes over 256 MiB may not grow by more than this; the border of a label
-alone takes more than that."""
+"""bzip2 compresses zeros almost without limit. Volumes over 256 MiB may not expand by more than this factor; the border
+of a label already prevents a higher compression."""
 _HEADS = {348: "Nifti1Header", 540: "Nifti2Header"}
 _SINGLE, _PAIR = (b"n+1", b"n+2"), (b"ni1", b"ni2")
 _MAGIC_AT = {348: 344, 540: 4}
@@ -62,21 +62,21 @@ _NRRD_TYPES = {
     "f8": ("double",),
 }
 _META_TYPES = {"char": "signed char", "long": "int", "ulong": "uint", "ulong long": "ulonglong"}
-"""Type of MetaImage after `MET_` -> name in NRRD, where they differ; others have the same."""
+"""Type of MetaImage after `MET_` -> name in NRRD, for types whose names differ."""
 _TRUE = ("true", "1")
 _META_END = re.compile(rb"^ElementDataFile\s*=[ \t]*(.*?)[ \t]*\r?(?:\n|\Z)", re.MULTILINE)
-# Sign of each axis of a space that takes it to right, anterior, superior.
+# Sign of each axis of a space that converts it to right, anterior, superior.
 _NRRD_SPACES = {
     "right-anterior-superior": (1, 1, 1), "ras": (1, 1, 1),
     "left-anterior-superior": (-1, 1, 1), "las": (-1, 1, 1),
     "left-posterior-superior": (-1, -1, 1), "lps": (-1, -1, 1),
 }  # fmt: skip
-_UNORIENTED = "Its header does not say how it lies in the patient, so that left and right may be swapped."
+_UNORIENTED = "Its header does not state the orientation in the patient, so left and right may be swapped."
 _LEAST_MM, _MOST_MM = 1e-4, 1e3  # mm, voxel sizes from microscopy to thick slices; beyond them the unit is wrong
 _FLAT = 1e-4  # volume of unit axes below which they are coplanar
-_APART_MM = 0.1  # mm by which sform and qform may differ at the corners: rounding, below a voxel
+_APART_MM = 0.1  # mm, tolerated difference of sform and qform at the corners: rounding, less than a voxel
 _ROUNDING = 1e-4
-"""Labels that were stored with a slope, or as float32, come back whole but for rounding."""
+"""Tolerated difference from integers of labels that are stored as float32 or with a slope (rounding)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,15 +84,15 @@ class _VolumeHeader:
     """Shape, type and orientation that a header declares.
 
     Args:
-        shape: of the voxels, in the order of the file, which runs along the first axis first.
-        kind: of a voxel.
-        start: bytes before the first voxel.
-        affine: (4, 4) from voxels to RAS mm.
-        slope: what a value in the file is multiplied with.
-        shift: what is then added.
-        notes: what is worth saying.
-        axes: which of the axes are those of space.
-        segments: of 3D Slicer; with them, another axis may be that of layers.
+        shape: numbers of voxels along the axes of the file; the first axis varies fastest.
+        kind: data type of a voxel.
+        start: number of bytes before the first voxel.
+        affine: (4, 4) affine transform from voxels to RAS, mm.
+        slope: factor by which values in the file are multiplied.
+        shift: offset added to the values after multiplication.
+        notes: sentences for the user about the header.
+        axes: indices of the three spatial axes.
+        segments: segments of 3D Slicer, if any; one further axis may then be that of layers.
     """
 
     shape: tuple[int, ...]
@@ -111,7 +111,7 @@ class _VolumeHeader:
 
 
 def require_volumes_extra() -> None:
-    """Check that what volumes need is there.
+    """Check that the packages for volumes are installed.
 
     Raises:
         ShapespaceError: the extra `volumes` is not installed.
@@ -133,23 +133,23 @@ def volume_name(path: Path) -> str:
 
 
 def read_volume(path: Path | str, *, max_memory_bytes: int = MAX_MEMORY_BYTES) -> LabelVolume:
-    """Read a label volume and where its voxels lie in the patient.
+    """Read a label volume and the position of its voxels in the patient.
 
     Args:
-        path: a file with one of the endings in `VOLUME_ENDINGS`, in any case.
-        max_memory_bytes: a volume that takes more memory is refused by its header, before memory is allocated.
+        path: path of a file with one of the endings in `VOLUME_ENDINGS`, in upper or lower case.
+        max_memory_bytes: largest allowed memory of the volume, bytes, checked before memory is allocated.
 
     Returns:
-        Its labels, and the affine from voxels to RAS millimetres: of NIfTI the sform, else the qform; of NRRD space
-        directions and origin, with LPS and LAS turned to RAS, and units to millimetres; of MetaImage TransformMatrix,
-        Offset and ElementSpacing, which are in LPS. Segments of 3D Slicer have
-        their names; those that overlap are in layers.
+        The labels, and the affine transform from voxels to RAS, mm. For NIfTI, this is the sform, or else the qform.
+        For NRRD, it is computed from space directions and origin, with LPS and LAS converted to RAS and units to
+        millimetres. For MetaImage, it is computed from TransformMatrix, Offset and ElementSpacing, which are in LPS.
+        Segments of 3D Slicer keep their names; overlapping segments are in layers.
 
     Raises:
         ShapespaceError: the extra `volumes` is not installed.
         FileError: it does not exist, cannot be read, or is too large.
-        FileFormatError: it is no such volume, cut short or damaged, or declares more than it holds.
-        InputError: it is not one volume of labels in a space of three dimensions, or takes too much memory.
+        FileFormatError: it is not such a volume, is cut short or damaged, or declares more voxels than it contains.
+        InputError: it is not a single 3-D volume of labels, or takes too much memory.
     """
     path = Path(path)
     require_volumes_extra()
@@ -157,8 +157,8 @@ def read_volume(path: Path | str, *, max_memory_bytes: int = MAX_MEMORY_BYTES) -
     if name.endswith((".nhdr", ".hdr", ".img")):
         raise damage_error(path, "its header and its data are two files; save it as one, .nii.gz or .nrrd")
     if not name.endswith(VOLUME_ENDINGS):
-        raise damage_error(path, f"it is not a volume by its ending; use one of {', '.join(VOLUME_ENDINGS)}")
-    # A damaged header may have numbers that are not finite, which are refused below.
+        raise damage_error(path, f"its ending is not that of a volume; use one of {', '.join(VOLUME_ENDINGS)}")
+    # A damaged header may contain non-finite numbers, which are rejected below.
     with open_file(path) as file, ExitStack() as stack, np.errstate(invalid="ignore", over="ignore"):
         try:
             size = os.fstat(file.fileno()).st_size
@@ -177,7 +177,7 @@ def read_volume(path: Path | str, *, max_memory_bytes: int = MAX_MEMORY_BYTES) -
 def _check_size(size: int, path: Path) -> None:
     if size > _MOST_BYTES + _MOST_HEADER:
         raise FileError(
-            f"Cannot read {path}: it has {size:,} bytes, over the bound of {_MOST_BYTES:,}; crop it, as by 3D Slicer."
+            f"Cannot read {path}: it has {size:,} bytes, over the limit of {_MOST_BYTES:,}; crop it, as in 3D Slicer."
         )
     if not size:
         raise damage_error(path, "it is empty; export or copy it again")
@@ -188,7 +188,7 @@ def _open_nifti(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tupl
     zipped = file.read(2) == b"\x1f\x8b"
     file.seek(0)
     stream: IO[bytes] = cast("IO[bytes]", stack.enter_context(gzip.GzipFile(fileobj=file))) if zipped else file
-    with _unpacking(path):
+    with _translate_errors(path):
         head = _nifti_head(stream.read(540), path)
         _check_declared(head, size * _DEFLATE_GROWTH if zipped else size, path)
         stream.seek(head.start)
@@ -196,7 +196,7 @@ def _open_nifti(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tupl
 
 
 @contextmanager
-def _unpacking(path: Path) -> Generator[None]:
+def _translate_errors(path: Path) -> Generator[None]:
     try:
         yield
     except FileError:
@@ -217,12 +217,12 @@ def _labels(stream: IO[bytes], head: _VolumeHeader, max_memory_bytes: int, path:
             f"memory, over the limit of {max_memory_bytes / 2**30:.2g} GiB; crop or resample it, or allow "
             "more (--max-memory)."
         )
-    # Pages that stay zero, as most of a mask is, take no memory.
+    # Memory pages of zeros, such as most of a mask, are not allocated.
     labels = np.zeros(count, dtype=kind)
-    values = _Values()
+    values = _LabelStatistics()
     buffer = memoryview(bytearray(min(_PIECE, head.bytes)))
     offset = 0
-    with _unpacking(path):
+    with _translate_errors(path):
         while offset < count:
             request_bytes = min(len(buffer), (count - offset) * head.kind.itemsize)
             read = _fill_buffer(stream, buffer[:request_bytes])
@@ -234,10 +234,10 @@ def _labels(stream: IO[bytes], head: _VolumeHeader, max_memory_bytes: int, path:
             piece: npt.NDArray[Any] = np.frombuffer(buffer[:request_bytes], dtype=head.kind)
             if piece.any() or not is_integral:
                 labels[offset : offset + len(piece)] = (
-                    piece if is_integral else values.rounded(piece * head.slope + head.shift, path)
+                    piece if is_integral else values.round_labels(piece * head.slope + head.shift, path)
                 )
             offset += len(piece)
-        # The checksum of a stream is only looked at where it ends.
+        # The checksum of a stream is checked only at its end.
         stream.read(1)
     values.check(path)
     return labels
@@ -252,35 +252,35 @@ def _fill_buffer(stream: IO[bytes], view: memoryview) -> int:
 
 
 @dataclass
-class _Values:
+class _LabelStatistics:
     """Statistics of label values that are stored as floats or with a slope."""
 
     low: float = math.inf
     high: float = -math.inf
     off: float = 0.0
 
-    def rounded(self, values: npt.NDArray[Any], path: Path) -> npt.NDArray[Any]:
-        """Return a piece of them as whole numbers; zeros where they are no labels, which `check` refuses."""
+    def round_labels(self, values: npt.NDArray[Any], path: Path) -> npt.NDArray[Any]:
+        """Return values as integers, or zeros if they are not labels, for which `check` raises an error."""
         low, high = float(values.min()), float(values.max())
         if not math.isfinite(low) or not math.isfinite(high):
-            raise InputError(f"{path} has voxels that are not finite, so it holds no labels; give the label map.")
+            raise InputError(f"{path} has voxels that are not finite, so it is not a label map; give the label map.")
         self.low, self.high = min(self.low, low), max(self.high, high)
-        whole_values = np.rint(values)
-        self.off = max(self.off, float(np.abs(values - whole_values).max()))
-        return whole_values if self._are_labels() else np.zeros(len(values))
+        integers = np.rint(values)
+        self.off = max(self.off, float(np.abs(values - integers).max()))
+        return integers if self._are_labels() else np.zeros(len(values))
 
     def _are_labels(self) -> bool:
         return max(-self.low, self.high) < 2**31 and self.off <= _ROUNDING
 
     def check(self, path: Path) -> None:
-        """Refuse values that are no labels.
+        """Check that the values are labels.
 
         Raises:
-            InputError: some are not whole numbers, or too large.
+            InputError: some values are not integers, or are too large.
         """
         if not self._are_labels():
             raise InputError(
-                f"{path} has values between {self.low:.4g} and {self.high:.4g} that are not whole numbers, such as "
+                f"{path} has values between {self.low:.4g} and {self.high:.4g} that are not integers, such as "
                 "probabilities; convert them to labels first, for example by a threshold."
             )
 
@@ -302,18 +302,18 @@ def _nifti_head(start: bytes, path: Path) -> _VolumeHeader:
         affine, notes = _nifti_affine(header)
         unit = str(header.get_xyzt_units()[0])
     except Exception as error:
-        # What nibabel raises of a header that was tampered with is of any kind.
+        # nibabel may raise any exception for a manipulated header.
         raise damage_error(path, f"its header is damaged ({_first_words(error)}), so export it again") from error
     if unit not in _NIFTI_MM:
         raise damage_error(path, f"its header gives lengths in '{unit}', so export it again in mm")
     if offset < size:
-        raise damage_error(path, f"its header says that the voxels begin within the header; {CUT_SHORT}")
+        raise damage_error(path, f"its header declares that the voxels begin within the header; {CUT_SHORT}")
     slope, shift = (1.0, 0.0) if slope is None else (float(slope), float(shift or 0.0))
     return _VolumeHeader(
         shape=shape,
         kind=kind,
         start=offset,
-        affine=_in_mm(affine, _NIFTI_MM[unit]),
+        affine=_to_mm(affine, _NIFTI_MM[unit]),
         slope=slope,
         shift=shift,
         notes=notes,
@@ -322,7 +322,7 @@ def _nifti_head(start: bytes, path: Path) -> _VolumeHeader:
 
 def _nifti_affine(header: Any) -> tuple[FloatArray, tuple[str, ...]]:
     form, code = header.get_sform(coded=True)
-    other, other_code = header.get_qform(coded=True) if not code else _quiet_qform(header)
+    other, other_code = header.get_qform(coded=True) if not code else _read_qform(header)
     if not code and not other_code:
         return np.array(header.get_base_affine(), dtype=np.float64), (_UNORIENTED,)
     if not code:
@@ -333,16 +333,14 @@ def _nifti_affine(header: Any) -> tuple[FloatArray, tuple[str, ...]]:
         corners = np.array([[0, 0, 0, 1], [*np.array(header.get_data_shape())[:3], 1]], dtype=np.float64)
         distance_mm = float(np.abs(corners @ (affine - np.asarray(other)).T).max())
         if distance_mm > _APART_MM:
-            notes = (
-                f"Its header says in two ways where it lies, up to {distance_mm:.3g} mm apart; the sform is taken.",
-            )
+            notes = (f"Its sform and qform disagree by up to {distance_mm:.3g} mm; the sform is used.",)
     return affine, notes
 
 
-def _quiet_qform(header: Any) -> tuple[Any, int]:
+def _read_qform(header: Any) -> tuple[Any, int]:
     try:
         return header.get_qform(coded=True)
-    except Exception:  # the sform is taken, so that a bad qform does no harm
+    except Exception:  # an invalid qform is ignored, because the sform is used
         return None, 0
 
 
@@ -360,12 +358,12 @@ def _open_nrrd(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tuple
     try:
         fields: dict[str, Any] = dict(nrrd.read_header(io.StringIO(data[:start].decode("utf-8", "replace"))))
     except Exception as error:
-        # What pynrrd raises of a header that was tampered with is of any kind.
+        # pynrrd may raise any exception for a manipulated header.
         raise damage_error(path, f"its header is damaged ({_first_words(error)}), so export it again") from error
     if "data file" in fields or "datafile" in fields:
         raise damage_error(path, "its data are in another file; save it with header and data in one")
     if any(fields.get(key) for key in ("line skip", "lineskip", "byte skip", "byteskip")):
-        raise damage_error(path, "its header skips a part of the data, which is not read; save it again")
+        raise damage_error(path, "its header skips a part of the data, which is not supported; save it again")
     head = _nrrd_head(fields, path)
     encoding = str(fields.get("encoding", "")).lower()
     encoding = {"gz": "gzip", "bz2": "bzip2"}.get(encoding, encoding)
@@ -378,7 +376,7 @@ def _open_nrrd(file: BinaryIO, size: int, stack: ExitStack, path: Path) -> tuple
 def _voxel_stream(
     file: BinaryIO, encoding: str, head: _VolumeHeader, size: int, stack: ExitStack, path: Path
 ) -> IO[bytes]:
-    """Return a stream of the voxels in the `size` bytes that follow in a file, which can hold what is declared."""
+    """Return a stream of the voxels in the next `size` bytes of a file, and check that all voxels fit in them."""
     growth = {"raw": size, "bzip2": _BZIP2_SPARE + _BZIP2_GROWTH * size}
     _check_declared(head, growth.get(encoding, _DEFLATE_GROWTH * size), path)
     if encoding == "gzip":
@@ -460,11 +458,11 @@ def _nrrd_head(fields: dict[str, Any], path: Path) -> _VolumeHeader:
     code = kinds.get(str(fields.get("type", "")).lower())
     if code is None:
         raise damage_error(
-            path, f"its voxels are of the type '{fields.get('type')}', which holds no labels; export it again"
+            path, f"its voxels are of the type '{fields.get('type')}', which is not a type of labels; export it again"
         )
     order = str(fields.get("endian", "little")).lower()
     if order not in ("little", "big"):
-        raise damage_error(path, f"its header says endian '{order[:40]}', so export it again")
+        raise damage_error(path, f"its header states endian '{order[:40]}', so export it again")
     try:
         shape = tuple(int(n) for n in fields["sizes"])
         if len(shape) != int(fields["dimension"]):
@@ -488,27 +486,27 @@ def _segment(fields: dict[str, Any], n: int) -> Segment:
 
 
 def _nrrd_affine(fields: dict[str, Any], path: Path) -> tuple[FloatArray, tuple[str, ...], tuple[int, ...]]:
-    """Return the affine, what is worth saying, and which of the axes are those of space."""
+    """Return the affine transform (4, 4), notes for the user, and the indices of the spatial axes."""
     directions, space = fields.get("space directions"), str(fields.get("space", "")).lower()
     if directions is None:
         if fields.get("spacings") is None:
-            raise InputError(f"{path}: its header does not say how large a voxel is; export it again with spacings.")
+            raise InputError(f"{path}: its header does not state the voxel size; export it again with spacings.")
         spacings = np.asarray(fields["spacings"], dtype=np.float64)
         axes = tuple(map(int, np.flatnonzero(~np.isnan(spacings))))
         return _affine(np.diag(spacings[list(axes[:3])]), np.zeros(3)), (_UNORIENTED,), axes
     axis_vectors = [None if row is None else np.asarray(row, dtype=np.float64) for row in directions]
     rows = {axis: row for axis, row in enumerate(axis_vectors) if row is not None and not np.isnan(row).all()}
     if len(rows) != 3 or any(row.shape != (3,) for row in rows.values()):
-        raise InputError(f"{path}: it does not lie in a space of three dimensions; save one volume of labels as LPS.")
+        raise InputError(f"{path}: its space does not have three dimensions; save one volume of labels as LPS.")
     signs = _NRRD_SPACES.get(space)
     if signs is None and space not in ("", "3d-right-handed", "scanner-xyz"):
-        raise InputError(f"{path}: its space is '{space[:60]}', which is not known; save it as LPS or RAS.")
+        raise InputError(f"{path}: its space is '{space[:60]}', which is not supported; save it as LPS or RAS.")
     units = {str(unit).strip('" ').lower() for unit in fields.get("space units") or ("mm",)}
     if len(units) != 1 or (unit := units.pop()) not in MM_OF_UNITS:
         raise InputError(f"{path}: its space units are not one of mm, cm, m and um; save it in mm.")
     origin = np.asarray(fields.get("space origin", np.zeros(3)), dtype=np.float64).reshape(3)
     turn = np.diag(np.array(signs or (1, 1, 1), dtype=np.float64))
-    affine = _in_mm(_affine(turn @ np.array(list(rows.values())).T, turn @ origin), MM_OF_UNITS[unit])
+    affine = _to_mm(_affine(turn @ np.array(list(rows.values())).T, turn @ origin), MM_OF_UNITS[unit])
     return affine, () if signs else (_UNORIENTED,), tuple(rows)
 
 
@@ -518,36 +516,36 @@ def _affine(steps: FloatArray, origin: FloatArray) -> FloatArray:
     return affine
 
 
-def _in_mm(affine: FloatArray, mm: float) -> FloatArray:
+def _to_mm(affine: FloatArray, mm: float) -> FloatArray:
     return _affine(affine[:3, :3] * mm, affine[:3, 3] * mm)
 
 
 def _check_declared(head: _VolumeHeader, most_bytes: int, path: Path) -> None:
-    """Refuse a header that declares no label voxels, or more bytes than its file can unpack to."""
+    """Check that a header declares label voxels, and not more bytes than its file can unpack to."""
     size = " x ".join(map(str, head.shape)) or "no"
     if head.kind.kind not in "iuf":
         raise InputError(f"{path} has voxels of colours or complex numbers, not of labels; save the label map alone.")
     if not head.shape or min(head.shape) < 1:
-        raise damage_error(path, f"its header declares {size} voxels, so that there are none; export it again")
+        raise damage_error(path, f"its header declares {size} voxels, so the volume is empty; export it again")
     if head.bytes > _MOST_BYTES:
         raise damage_error(
             path,
-            f"its header declares {size} voxels, {head.bytes:,} bytes, over the bound of {_MOST_BYTES:,}; crop it, as "
-            "by 3D Slicer",
+            f"its header declares {size} voxels, {head.bytes:,} bytes, over the limit of {_MOST_BYTES:,}; crop it, as "
+            "in 3D Slicer",
         )
     if head.start + head.bytes > _MOST_BYTES + _MOST_HEADER or head.start + head.bytes > most_bytes:
-        raise damage_error(path, f"its header declares {size} voxels, more than the file can hold; {CUT_SHORT}")
+        raise damage_error(path, f"its header declares {size} voxels, more than the file can contain; {CUT_SHORT}")
 
 
 def _spatial_order(head: _VolumeHeader, path: Path) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Return the axes in the order space, layers, and the shape (X, Y, Z) or (X, Y, Z, L) of the labels."""
+    """Return the axes with the spatial ones first, and the shape (X, Y, Z) or (X, Y, Z, L) of the labels."""
     size = " x ".join(map(str, head.shape))
     if len(head.shape) < 3 or len(head.axes) != 3:
-        raise InputError(f"{path} has {len(head.shape)} dimensions ({size}), which is no volume; give one of labels.")
+        raise InputError(f"{path} has {len(head.shape)} dimensions ({size}), which is not a volume; give a label map.")
     others = tuple(axis for axis in range(len(head.shape)) if axis not in head.axes)
     layers = tuple(head.shape[axis] for axis in others if head.shape[axis] > 1)
     if len(layers) > (1 if head.segments else 0):
-        raise InputError(f"{path} has {len(head.shape)} dimensions ({size}), more than one volume; give one of labels.")
+        raise InputError(f"{path} has {len(head.shape)} dimensions ({size}), more than one volume; give a label map.")
     return (*head.axes, *others), (*(head.shape[axis] for axis in head.axes), *layers)
 
 

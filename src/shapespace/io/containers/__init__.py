@@ -1,5 +1,5 @@
-"""File containers with bounds on what they may cost to read: archives, HDF5, JSON.
+"""File containers that are read within limits of memory and time: archives, HDF5, JSON.
 
-Entry points: `archives`, `hdf5`, `json_files`. Imported by the readers beside it and by `model`, `recognise` and
-`store`.
+Entry points: `archives`, `hdf5`, `json_files`. Imported by the readers of `io` and by `model`, `recognise`
+and `store`.
 """

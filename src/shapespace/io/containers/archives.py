@@ -22,14 +22,14 @@ from shapespace.io.parsing import CUT_SHORT, damage_error
 from shapespace.io.read_limits import GROWTH
 
 GZIP: Final = b"\x1f\x8b"
-"""With which a gzip file begins."""
+"""First bytes of a gzip file."""
 LARGEST_BYTES: Final = 2**30  # 1 GiB, packed
 _MOST_MEMBERS = 4096  # limit on damaged files; results have tens
 _MOST_PACKED = 100
-"""Times its own size that an archive may unpack to; what we write unpacks to a few times."""
+"""Largest ratio of the unpacked to the packed size of an archive; archives of shapespace reach a few times."""
 _SMALL = 2**20  # 1 MiB that any file may unpack to, and elements that an array without data may declare
 _PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-_TOLD = 80  # characters of a library's message
+_LONGEST_REASON = 80  # characters of a library's message
 _PLAIN_KINDS = "biufU"
 _LONGEST_AXIS = 2**31 - 1  # indices are int32
 _HEADER_READERS: Final[Mapping[tuple[int, int], Callable[[IO[bytes]], tuple[Any, Any, Any]]]] = {
@@ -39,7 +39,7 @@ _HEADER_READERS: Final[Mapping[tuple[int, int], Callable[[IO[bytes]], tuple[Any,
 
 
 def write_arrays(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
-    """Write `arrays` to `path`, whole or not at all.
+    """Write `arrays` to `path` atomically.
 
     Raises:
         FileError: the folder cannot be written, or the disk is full.
@@ -52,13 +52,13 @@ def read_arrays(path: Path, remedy: str, member_names: Collection[str] | None = 
     """Return the arrays of an .npz file by name.
 
     Args:
-        path: of the file.
-        remedy: what a reader can do about a file that is wrong.
-        member_names: names of arrays; others are not looked at. None for all.
+        path: path of the .npz file.
+        remedy: advice for the user at the end of an error message, as a clause.
+        member_names: names of the arrays to read; None for all.
 
     Raises:
         FileError: it cannot be read.
-        FileFormatError: it is damaged, holds other things than arrays, or unpacks to far more than its size.
+        FileFormatError: it is damaged, contains other things than arrays, or unpacks to far more than its size.
     """
     check_file(path, LARGEST_BYTES, remedy)
     try:
@@ -73,7 +73,7 @@ def read_arrays(path: Path, remedy: str, member_names: Collection[str] | None = 
 
 
 def kept_arrays(path: Path) -> dict[str, npt.NDArray[Any]] | None:
-    """Return the arrays in `path`; None where there are none, or none that are whole."""
+    """Return the arrays in `path`, or None if the file is missing, unreadable or damaged."""
     try:
         with path.open("rb") as stream:
             return arrays_in(stream, path.stat().st_size)
@@ -82,11 +82,11 @@ def kept_arrays(path: Path) -> dict[str, npt.NDArray[Any]] | None:
 
 
 def arrays_in(stream: BinaryIO, size: int, member_names: Collection[str] | None = None) -> dict[str, npt.NDArray[Any]]:
-    """Return the arrays of an .npz in `stream`, of `size` bytes, by name, those of `member_names` or all.
+    """Return the arrays of an .npz file in `stream` by name, limited to `member_names` unless that is None.
 
     Raises:
         OSError: it cannot be read.
-        ValueError: as `read_arrays` refuses.
+        ValueError: it is damaged, contains other things than arrays, or unpacks to far more than `size` bytes.
     """
     arrays: dict[str, npt.NDArray[Any]] = {}
     for name, content in _members(
@@ -100,17 +100,17 @@ def arrays_in(stream: BinaryIO, size: int, member_names: Collection[str] | None 
 
 
 def zip_members(stream: BinaryIO, size: int, member_names: Collection[str] | None = None) -> dict[str, bytes]:
-    """Return the members of the archive in `stream`, of `size` bytes, by name, those of `member_names` or all.
+    """Return the members of the archive in `stream` by name, limited to `member_names` unless that is None.
 
     Raises:
         OSError: it cannot be read.
-        ValueError: it is no archive, is damaged, or would unpack to far more than its size.
+        ValueError: it is not an archive, is damaged, or would unpack to far more than `size` bytes.
     """
     return dict(_members(stream, size, member_names))
 
 
 def _members(stream: BinaryIO, size: int, member_names: Collection[str] | None) -> Generator[tuple[str, bytes]]:
-    """Yield name and content of each member, so that one at a time is in memory."""
+    """Yield name and content of each member; only one member at a time is in memory."""
     try:
         with zipfile.ZipFile(stream) as archive:
             for name in _checked_names(archive, size):
@@ -118,8 +118,8 @@ def _members(stream: BinaryIO, size: int, member_names: Collection[str] | None) 
                     yield name, archive.read(name)
     except OSError:
         raise
-    except Exception as error:  # a damaged archive may raise anything at all
-        raise ValueError(" ".join(str(error).split())[:_TOLD] or "it is damaged") from error
+    except Exception as error:  # a damaged archive may raise any exception
+        raise ValueError(" ".join(str(error).split())[:_LONGEST_REASON] or "it is damaged") from error
 
 
 def _checked_names(archive: zipfile.ZipFile, size: int) -> list[str]:
@@ -135,22 +135,22 @@ def _checked_names(archive: zipfile.ZipFile, size: int) -> list[str]:
     if sum(info.file_size for info in infos) > max(_SMALL, _MOST_PACKED * size):
         raise ValueError("it would unpack to far more than its size")
     if any(info.compress_type not in _PACKED for info in infos):
-        raise ValueError("it is packed in a way that we do not use")
+        raise ValueError("it uses an unsupported compression method")
     return names
 
 
 def read_row(path: Path, name: str, row: int, remedy: str) -> tuple[npt.NDArray[Any], int]:
-    """Return one row of an array of floats in an .npz file, and the number of rows; the others are never in memory.
+    """Return one row of an array of floats in an .npz file, and the number of rows, without loading the other rows.
 
     Args:
-        path: of the file.
-        name: of the array.
-        row: along the first axis.
-        remedy: what a reader can do about a file that is wrong.
+        path: path of the .npz file.
+        name: name of the array in the file.
+        row: index of the row along the first axis.
+        remedy: advice for the user at the end of an error message, as a clause.
 
     Raises:
         FileError: it cannot be read.
-        FileFormatError: as of `read_arrays`, or it has no such array or row.
+        FileFormatError: it has no such array or row, or see `read_arrays`.
     """
     check_file(path, LARGEST_BYTES, remedy)
     try:
@@ -163,7 +163,7 @@ def read_row(path: Path, name: str, row: int, remedy: str) -> tuple[npt.NDArray[
                 stored = archive.getinfo(f"{name}.npy").file_size - content.tell()
                 rows = shape[0] if len(shape) > 1 else 0
                 if dtype.kind != "f" or declared != stored or fortran:
-                    raise ValueError(f"{name} is not the array of floats that its header says")
+                    raise ValueError(f"{name} is not the array of floats that its header declares")
                 if not 0 <= row < rows:
                     raise ValueError(f"{name} has {rows} rows, and not row {row}")
                 content.seek(content.tell() + row * (declared // rows))
@@ -171,8 +171,8 @@ def read_row(path: Path, name: str, row: int, remedy: str) -> tuple[npt.NDArray[
                 return np.frombuffer(data, dtype).reshape(shape[1:]).copy(), rows
     except OSError as error:
         raise read_error(path, error) from error
-    except Exception as error:  # a damaged archive may raise anything at all
-        problem = " ".join(str(error).split())[:_TOLD] or "it is damaged"
+    except Exception as error:  # a damaged archive may raise any exception
+        problem = " ".join(str(error).split())[:_LONGEST_REASON] or "it is damaged"
         raise FileFormatError(
             f"{path} is not an .npz file of arrays, or it is cut short ({problem}); {remedy}."
         ) from error
@@ -188,29 +188,30 @@ def npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]
         The shape, whether the first axis varies fastest, and the type of the elements.
 
     Raises:
-        ValueError: the header is damaged, or an axis is not a whole number from 0 to `_LONGEST_AXIS`, as a clause.
+        ValueError: the header is damaged, or the length of an axis is not an integer from 0 to `_LONGEST_AXIS`; the
+            message is a clause.
     """
     try:
         shape, fortran, dtype = _HEADER_READERS[npy.read_magic(stream)](stream)
-    except Exception as error:  # numpy's own parser of headers may raise anything at all
+    except Exception as error:  # numpy's parser of headers may raise any exception
         raise ValueError("is not an array") from error
     # numpy accepts truth values as lengths of axes.
     if not all(type(length) is int and 0 <= length <= _LONGEST_AXIS for length in shape):
-        raise ValueError("has an axis whose length is not a whole number, is negative or is too large")
+        raise ValueError("has an axis whose length is not an integer, is negative or is too large")
     return tuple(shape), bool(fortran), dtype
 
 
 def npy_array(data: bytes) -> npt.NDArray[Any]:
-    """Return the array in the .npy file `data`, of numbers, truth values or text.
+    """Return the array of numbers, truth values or text in the .npy file `data`.
 
     Raises:
-        ValueError: it is none, or it declares more or less than it holds, as a clause.
+        ValueError: it is no such array, or its size differs from its header; the message is a clause.
     """
     stream = io.BytesIO(data)
     shape, fortran, dtype = npy_header(stream)
     start = stream.tell()
     if dtype.kind not in _PLAIN_KINDS or math.prod(shape) * dtype.itemsize != len(data) - start:
-        raise ValueError("is cut short or holds objects, and is not what its header says")
+        raise ValueError("is cut short or contains objects, and does not match its header")
     # An array without elements takes no memory, but a loop over its longest axis takes time.
     if len(data) == start and max(shape, default=0) > _SMALL:
         raise ValueError("is empty and has an axis that is too long")
@@ -221,12 +222,12 @@ def npy_array(data: bytes) -> npt.NDArray[Any]:
 
 
 def unpack_gzip(data: bytes, path: Path, max_bytes: int) -> bytes:
-    """Return what `data`, all of a gzip file, holds.
+    """Return the unpacked content of a gzip file.
 
     Args:
-        data: the whole file.
-        path: its name, for messages.
-        max_bytes: largest size of the content.
+        data: complete content of the gzip file.
+        path: path of the file, used in messages.
+        max_bytes: largest allowed size of the unpacked content, bytes.
 
     Raises:
         FileFormatError: it is cut short or damaged, or unpacks to more than `max_bytes`, or `read_limits.GROWTH` times
@@ -240,6 +241,6 @@ def unpack_gzip(data: bytes, path: Path, max_bytes: int) -> bytes:
         raise damage_error(path, f"its compressed data end early or are wrong; {CUT_SHORT}") from error
     if len(content) > max_bytes:
         raise damage_error(
-            path, f"it unpacks to more than {max_bytes / 2**20:.0f} MiB, so unpack it with gunzip and look at it"
+            path, f"it unpacks to more than {max_bytes / 2**20:.0f} MiB, so unpack it with gunzip and check its content"
         )
     return content

@@ -1,14 +1,14 @@
 """Named arrays and attributes in one HDF5 file, with a hash that detects later changes.
 
-The first 512 bytes (an HDF5 user block, which HDF5 tools skip) hold the SHA-256 of the rest, and are checked before
-anything else is read. A content hash over the arrays and attributes themselves travels inside.
+The first 512 bytes (an HDF5 user block, which HDF5 tools skip) contain the SHA-256 of the rest, which is checked before
+anything else is read. An attribute contains a second hash, over the arrays and attributes themselves.
 
-The HDF5 library writes, but never reads. It follows links to other files and devices, takes what memory a header asks
-for, and hangs or crashes in damaged structures; a checksum does not help against who recomputes it. So only the subset
-that we write is read, and all else refused: superblock 0, one group of names, each with an array in one piece, and
-attributes that are a number or a text ("HDF5 File Format Specification", versions 1 of its parts). Nothing is followed
-but addresses within the file, no step is taken more often than `_MOST` times, and arrays and texts together are no
-larger than the file, however often they are named.
+The HDF5 library is used for writing only. It follows links to other files and devices, allocates as much memory as a
+header declares, and hangs or crashes in damaged structures; a checksum does not protect against an attacker who
+recomputes it. The reader of this module therefore accepts only the subset that `write_hdf5` writes and rejects other
+features: superblock 0, one group of names, each of a contiguous array, and attributes that are a number or a text
+("HDF5 File Format Specification", version 1 of each structure). The reader follows only addresses within the file,
+repeats no step more than `_MOST` times, and limits arrays and texts together to the size of the file.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _IN_DATASET = {_NOTHING, _SPACE, _TYPE, _OLD_FILL, _FILL, _LAYOUT, _CHANGED}
 _IN_ROOT = {_NOTHING, _ATTRIBUTE, _GROUP, _CHANGED}
 _SHARED = 2  # header message flag, bit 1
 _ONE_PIECE = (3, 1)  # data layout message: version 3, contiguous storage
-# Each type as its message has it, zero bytes at the end left out: float64, then signed integers, little-endian.
+# Datatype messages without their trailing zero bytes: float64, then signed integers, little-endian.
 _NUMBERS = {
     bytes.fromhex("11203f000800000000004000340b0034ff03"): np.dtype("<f8"),
     bytes.fromhex("1008000004000000000020"): np.dtype("<i4"),
@@ -69,13 +69,13 @@ def content_hash(arrays: Mapping[str, npt.NDArray[Any]], attributes: Mapping[str
 
 
 def write_hdf5(path: Path, arrays: Mapping[str, npt.NDArray[Any]], attributes: Mapping[str, Attribute]) -> str:
-    """Write `arrays` and `attributes` to `path`, whole or not at all, and return their content hash.
+    """Write `arrays` and `attributes` to `path` atomically, and return their content hash.
 
     Raises:
         FileError: the folder cannot be written, or the disk is full.
-        FileFormatError: a text that cannot be stored, or this version of h5py does not write what `read_hdf5` reads.
+        FileFormatError: a text cannot be stored, or `read_hdf5` cannot read the output of this version of h5py.
     """
-    import h5py  # a twentieth of a second that only those who write should wait
+    import h5py  # slow import (0.05 s), needed for writing only
 
     digest = content_hash(arrays, attributes)
     memory = io.BytesIO()
@@ -87,14 +87,14 @@ def write_hdf5(path: Path, arrays: Mapping[str, npt.NDArray[Any]], attributes: M
                 file.attrs[name] = value
             except ValueError as error:
                 raise FileFormatError(
-                    f"Cannot write {path}: the text of {name} holds a zero or what is no Unicode; leave that out."
+                    f"Cannot write {path}: the text of {name} contains a null character or invalid Unicode; remove it."
                 ) from error
     data = memory.getvalue()[_USER_BLOCK:]
     try:
         _Parts(memoryview(data)).read()
     except _OtherHdf5Error as error:
         raise FileFormatError(
-            f"{path} was not written: h5py {h5py.__version__} writes it so that it could not be read ({error}); "
+            f"{path} was not written: h5py {h5py.__version__} writes it in a form that cannot be read back ({error}); "
             "install another version of h5py."
         ) from error
     write_bytes(path, _user_block(data) + data)
@@ -106,8 +106,8 @@ def _user_block(data: bytes | memoryview) -> bytes:
 
 
 def is_ours(path: Path) -> bool:
-    """Whether `path` is a file that begins as `write_hdf5` has files begin; False where it cannot be read."""
-    if not path.is_file():  # a pipe would have its reader wait
+    """Return whether `path` begins like a file of `write_hdf5`; False if it cannot be read."""
+    if not path.is_file():  # opening a pipe would block
         return False
     try:
         with open_file(path) as file:
@@ -146,7 +146,7 @@ def read_hdf5(path: Path) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Attrib
         arrays, attributes = _Parts(memoryview(data)[_USER_BLOCK:]).read()
     except _OtherHdf5Error as error:
         raise FileFormatError(
-            f"{path} is HDF5 but not as shapespace writes it: {error}; give a model written by shapespace build."
+            f"{path} is HDF5, but not in the layout of shapespace: {error}; give a model written by shapespace build."
         ) from error
     if attributes.get(_HASH_NAME) != content_hash(arrays, attributes):
         raise damaged
@@ -167,7 +167,7 @@ class _Parts:
     def read(self) -> tuple[Arrays, dict[str, Attribute]]:
         signature, version, offset_bytes, length_bytes = self._fields("8sB4xBB", 0)
         if (signature, version, offset_bytes, length_bytes) != (SIGNATURE, 0, 8, 8):
-            raise _OtherHdf5Error("it begins otherwise")
+            raise _OtherHdf5Error("it has another superblock")
         root = self._messages(self._fields("Q", 64)[0], _IN_ROOT, "the file")
         attributes = dict(self._attribute(body) for kind, body in root if kind == _ATTRIBUTE)
         arrays: Arrays = {}
@@ -187,7 +187,7 @@ class _Parts:
         return _unpack(layout, self._bytes(offset, struct.calcsize(f"<{layout}")))
 
     def _charge(self, count: int, part_name: str) -> None:
-        """Take `count` bytes from what the file may fill in memory, before they are taken there."""
+        """Subtract `count` bytes from the remaining memory, before they are allocated."""
         self._left -= count
         if self._left < 0:
             raise _OtherHdf5Error(f"it declares {count} bytes in {part_name} but is only {len(self._data)} bytes long")
@@ -199,7 +199,7 @@ class _Parts:
             raise _OtherHdf5Error(f"{part_name} has a header of another version")
         messages: list[tuple[int, memoryview]] = []
         blocks = [self._bytes(offset + 16, length)]
-        for block in blocks:  # grows while it is walked, by what is continued elsewhere
+        for block in blocks:  # continuation messages append further blocks during the loop
             position = 0
             while position + 8 <= len(block):
                 kind, size, flags = _unpack("HHB", block[position : position + 5])
@@ -212,7 +212,7 @@ class _Parts:
                 elif kind in allowed:
                     messages.append((kind, body))
                 else:
-                    raise _OtherHdf5Error(f"{part_name} holds a feature of HDF5 ({kind:#04x}) that no model needs")
+                    raise _OtherHdf5Error(f"{part_name} uses a feature of HDF5 ({kind:#04x}) that no model needs")
         return messages
 
     def _names(self, tree: int, heap: int) -> list[tuple[str, int]]:
@@ -220,17 +220,17 @@ class _Parts:
         mark, kind, level, count = self._fields("4sBBH", tree)
         heap_mark, texts = self._fields("4s20xQ", heap)
         if (mark, kind, level, heap_mark) != (b"TREE", 0, 0, b"HEAP") or count > _MOST:
-            raise _OtherHdf5Error("its names stand otherwise")
+            raise _OtherHdf5Error("its names are stored in another layout")
         addresses: list[tuple[str, int]] = []
         for child in range(count):
             (node,) = self._fields("Q", tree + 32 + 16 * child)
             mark, entries = self._fields("4s2xH", node)
             if mark != b"SNOD" or len(addresses) + entries > _MOST:
-                raise _OtherHdf5Error("its names stand otherwise")
+                raise _OtherHdf5Error("its names are stored in another layout")
             for entry in range(entries):
                 name, header, link = self._fields("QQI", node + 8 + 40 * entry)
                 if link:
-                    raise _OtherHdf5Error("it holds a link or a group")
+                    raise _OtherHdf5Error("it contains a link or a group")
                 addresses.append((self._name(texts + name), header))
         return addresses
 
@@ -240,10 +240,10 @@ class _Parts:
     def _array(self, name: str, offset: int) -> npt.NDArray[Any]:
         messages = dict(self._messages(offset, _IN_DATASET, repr(name)))
         if not {_SPACE, _TYPE, _LAYOUT} <= messages.keys():
-            raise _OtherHdf5Error(f"{name!r} is no array")
+            raise _OtherHdf5Error(f"{name!r} is not an array")
         dtype = _NUMBERS.get(bytes(messages[_TYPE]).rstrip(b"\0"))
         if dtype is None:
-            raise _OtherHdf5Error(f"{name!r} is of another type than float64 and int32")
+            raise _OtherHdf5Error(f"{name!r} is neither float64 nor an integer of 32 or 64 bits")
         shape = _shape(messages[_SPACE])
         size = math.prod(shape) * dtype.itemsize
         self._charge(size, repr(name))
@@ -295,9 +295,9 @@ def _unpack(layout: str, data: memoryview | bytes) -> tuple[Any, ...]:
 def _shape(space: memoryview) -> tuple[int, ...]:
     version, rank = _unpack("BB", space[:2])
     if version != 1 or rank > _MOST_AXES:
-        raise _OtherHdf5Error("it holds an array of a strange shape")
+        raise _OtherHdf5Error("it contains an array with an invalid shape")
     return _unpack(f"{rank}Q", space[8 : 8 + 8 * rank])
 
 
 def _text(data: bytes) -> str:
-    return data.decode("utf-8", "replace")  # what is replaced does not match the checksum
+    return data.decode("utf-8", "replace")  # text with replacements fails the checksum

@@ -20,23 +20,23 @@ _LARGEST_INT = 2**63  # int64
 
 
 def read_json(path: Path, remedy: str, most_bytes: int = LARGEST_BYTES) -> Any:
-    """Return what `plain_json` makes of the file `path`.
+    """Return the value of the JSON file `path`, see `plain_json`.
 
     Args:
-        path: of the file.
-        remedy: what a reader can do about a file that is wrong.
-        most_bytes: that such a file can have.
+        path: path of the JSON file.
+        remedy: advice for the user at the end of an error message, as a clause.
+        most_bytes: largest allowed size of the file, bytes.
 
     Raises:
         FileError: it cannot be read.
-        FileFormatError: it is no file of so few bytes, or not plain JSON.
+        FileFormatError: it is not a regular file, is larger than `most_bytes`, or is not plain JSON.
     """
     check_file(path, most_bytes, remedy)
     return parse_json(read_bytes(path), path, remedy)
 
 
 def parse_json(content: bytes, path: Path, remedy: str) -> Any:
-    """Return what `plain_json` makes of the content of the file `path`, wherever that was read.
+    """Return the value of JSON `content`, see `plain_json`; `path` and `remedy` are used in error messages.
 
     Raises:
         FileFormatError: it is not plain JSON.
@@ -48,18 +48,18 @@ def parse_json(content: bytes, path: Path, remedy: str) -> Any:
 
 
 def check_file(path: Path, most_bytes: int, remedy: str) -> None:
-    """Refuse what is no file, such as a pipe at which a reader would wait, or larger than such a file can be.
+    """Check that `path` is a regular file or folder of at most `most_bytes`, and not a pipe, whose reader would block.
 
     Raises:
-        FileError: it is not there, or cannot be read.
-        FileFormatError: it is no file, or too large.
+        FileError: it does not exist, or cannot be read.
+        FileFormatError: it is a pipe or a device, or too large.
     """
     try:
         about = path.stat()
     except (OSError, ValueError) as error:
         raise read_error(path, error if isinstance(error, OSError) else OSError(str(error))) from error
     if not (stat.S_ISREG(about.st_mode) or stat.S_ISDIR(about.st_mode)):
-        raise FileFormatError(f"{path} is no file but a pipe or a device; {remedy}.")
+        raise FileFormatError(f"{path} is a pipe or a device, not a file; {remedy}.")
     if about.st_size > most_bytes:
         raise FileFormatError(f"{path} is larger ({about.st_size / 2**20:.0f} MiB) than such a file can be; {remedy}.")
 
@@ -68,7 +68,7 @@ def plain_json(text: bytes | str) -> Any:
     """Return the value in `text`, with None for numbers that are not finite.
 
     Raises:
-        ValueError: it is not JSON, is nested too deep, or holds a whole number of more than 64 bits.
+        ValueError: it is not JSON, is nested too deeply, or contains an integer of more than 64 bits.
     """
     try:
         value: object = _decode(text)
@@ -80,24 +80,24 @@ def plain_json(text: bytes | str) -> Any:
 
 
 def _make_plain(container: dict[Any, object] | list[object], depth: int) -> None:
-    """Check what a container holds, in place, since a large file is larger still in memory."""
+    """Check the items of a container and replace numbers that are not finite by None, in place to save memory."""
     if depth > _DEEPEST + 1:
         raise ValueError("it is nested too deep")
     for key, item in cast(
         Iterable[tuple[Any, object]], container.items() if isinstance(container, dict) else enumerate(container)
     ):
-        kind = item.__class__  # nearly all there is are numbers and words, for which a call would take longest
+        kind = item.__class__  # most items are numbers and words, for which a call would dominate the time
         if kind is float:
             if not math.isfinite(cast(float, item)):
                 container[key] = None
         elif kind is list or kind is dict:
             _make_plain(cast(list[object], item), depth + 1)
         elif kind is int and not -_LARGEST_INT <= cast(int, item) < _LARGEST_INT:
-            raise ValueError("it holds a number that is too large")
+            raise ValueError("it contains a number that is too large")
 
 
 def _decode(text: bytes | str) -> object:
-    """Return the value in `text`; what is not strict JSON, such as NaN, is left to the slower reader that takes it."""
+    """Return the value in `text`; the slower parser reads text that is not strict JSON, such as NaN."""
     try:
         return msgspec.json.decode(text)
     except msgspec.DecodeError:

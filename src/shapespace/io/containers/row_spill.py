@@ -1,7 +1,7 @@
 """Rows of single precision in a temporary file, for tables that do not fit into memory.
 
-The file holds panels of columns one after the other, each a C-ordered (rows, width) block of little-endian float32, so
-that both a block of rows and a block of columns are read in long runs. There is no header.
+The file contains panels of columns one after the other, each a C-ordered (rows, width) block of little-endian float32.
+Thus, both a block of rows and a block of columns are read in long runs. There is no header.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ class Spill:
     """A table (rows, columns) of float32 on disk, read as float64.
 
     Args:
-        path: its file.
-        rows: N.
-        columns: D.
-        new: whether to make the file, as large as the table at once; otherwise it is there.
+        path: path of the file.
+        rows: number of rows, N.
+        columns: number of columns, D.
+        new: whether to create the file with the size of the table; False to open an existing file.
 
     Raises:
         FileError: it cannot be written or read, or the disk is full.
-        FileFormatError: an old file is of another size.
+        FileFormatError: an existing file has another size.
     """
 
     def __init__(self, path: Path, rows: int, columns: int, *, new: bool) -> None:
@@ -58,7 +58,7 @@ class Spill:
             raise write_error(path, error) from error
 
     def _reserve(self, size: int) -> None:
-        # A disk that is too small is reported now, and not after an hour.
+        # Report a full disk now, and not after an hour of writing.
         if hasattr(os, "posix_fallocate") and size:
             os.posix_fallocate(self._file.fileno(), 0, size)
         else:
@@ -73,12 +73,12 @@ class Spill:
         self.close()
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._file.close()
 
     @property
     def block_rows(self) -> int:
-        """Rows of a block that takes some 64 MB as float64."""
+        """Number of rows in a block of about 64 MiB as float64."""
         return max(1, min(self.rows, _BLOCK_BYTES // (8 * max(self.columns, 1))))
 
     def write_rows(self, start: int, block: FloatArray) -> None:
@@ -107,12 +107,12 @@ class Spill:
         return out
 
     def row_blocks(self) -> Iterator[tuple[int, FloatArray]]:
-        """Yield (start, rows) of the whole table, in order."""
+        """Yield the index of the first row and the rows (n, D) of each block of the table, in order."""
         for start in range(0, self.rows, self.block_rows):
             yield start, self.rows_from(start, min(start + self.block_rows, self.rows))
 
     def column_blocks(self) -> Iterator[FloatArray]:
-        """Yield blocks of columns (N, w) of the whole table, in order."""
+        """Yield blocks of columns (N, w) that together are the complete table, in order."""
         for columns in self._panels():
             out = np.empty((self.rows, columns.stop - columns.start))
             for start in range(0, self.rows, 4096):
@@ -121,7 +121,7 @@ class Spill:
             yield out
 
     def to_disk(self) -> None:
-        """Wait until all that was written is on the disk.
+        """Wait until all written data are on the disk.
 
         Raises:
             FileError: the disk is full.

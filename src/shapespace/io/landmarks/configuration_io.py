@@ -50,18 +50,18 @@ _MANY = (".tps", *_TEXTS)
 _SPECIMEN_OF_FILE = (r"(?P<name>.+?)(?:[ ._-](?P<kind>[^ ._-]+))?", r"(?:(?P<kind>[^ ._-]+)[ ._-])?(?P<name>.+)")
 """Names of files of one specimen: NAME_landmarks and NAME_curve, or landmarks_NAME and curve_NAME."""
 _LINES = (".vtk", ".vtp")
-"""Endings of files that may hold lines, which are curves, or surfaces."""
+"""Endings of files that may contain lines, which are curves, or surfaces."""
 _MORPHOLOGIKA = re.compile(rb"^(?:\xef\xbb\xbf)?\s*\[\s*individuals\s*\]", re.IGNORECASE | re.MULTILINE)
-_HEAD_BYTES = 2**16  # 64 KiB hold the sections before the coordinates
+_HEAD_BYTES = 2**16  # 64 KiB contain the sections before the coordinates
 _TABLES = (".csv", ".txt", ".tsv", ".xlsx")
-_SINGLE = tuple(sorted({*LANDMARK_FORMATS, *READ_ONLY_LANDMARKS} - {".tps"}, key=lambda one: (-len(one), one)))
+_SINGLE = tuple(sorted({*LANDMARK_FORMATS, *READ_ONLY_LANDMARKS} - {".tps"}, key=lambda ending: (-len(ending), ending)))
 _MILLIMETRES = (".mrk.json", ".fcsv")
 _TPS_KEYS = ("image", "comment")
-"""Columns that TPS has keys for."""
+"""Columns for which TPS has keys."""
 RECORD = "align.json"
-"""File of a folder that `align` wrote, with its settings; its coordinates have been aligned."""
+"""File with the settings in a folder that `align` wrote, whose coordinates are already aligned."""
 CURVE_SLIDERS, SURFACE_SLIDERS = "curveslide.csv", "surfslide.csv"
-"""Files with the numbers of semilandmarks, from 1, as geomorph reads them: before, slide, after; surface."""
+"""Files with the numbers of semilandmarks, from 1, as in geomorph: before, slide, after; and those of surfaces."""
 
 CONFIGURATION_FORMATS: Mapping[str, str] = MappingProxyType(
     {"tps": ".tps", "nts": ".nts", "morphoj": ".txt", "csv": ".csv", "long": ".csv"}
@@ -84,21 +84,21 @@ def read_configurations(
     Formats: TPS with curves, outlines and scale, NTS, IDAV Landmark (.dta), Morphologika (.txt), wide and long tables
     (CSV, Excel), MorphoJ tables (.txt), arrays of R (.rda, .RData, .rds), and folders with a file for each specimen in
     any format of `read_landmarks`, TPS, NTS, or lines of VTK (.vtk, .vtp). Points of curves are semilandmarks; curves
-    with other numbers of points are resampled at equal distances. Values that are scaled, left out or taken as missing
-    are in the notes.
+    with other numbers of points are resampled at equal distances. Values that are scaled, omitted or interpreted as
+    missing are listed in the notes.
 
     Args:
-        path: the file or folder.
-        name: of the array, for R files with several.
-        sliders: tables of semilandmarks, as geomorph has them: before, slide, after; or surface alone. Each replaces
-            those in `path`.
-        curve_points: number of points to which each curve is resampled; None for the least number of a specimen, at
-            most 100, where specimens differ.
-        dimensions: 2 or 3, of a MorphoJ table of raw coordinates whose number fits both.
+        path: path of the file or folder.
+        name: name of the array, for R files with several.
+        sliders: paths of tables of semilandmarks as in geomorph: before, slide, after; or surface points only. Each
+            replaces those in `path`.
+        curve_points: number of points to which each curve is resampled; None for the smallest number among the
+            specimens, at most 100, if they differ.
+        dimensions: dimension of the space, 2 or 3, for a MorphoJ table whose number of coordinates fits both.
 
     Raises:
         FileError: it cannot be read, or is too long.
-        FileFormatError: it is damaged, is in none of the formats, or its specimens have other landmarks.
+        FileFormatError: it is damaged, is in none of the formats, or its specimens have different landmarks.
         InputError: two specimens have one name.
         ShapespaceError: the extra `r`, which R files need, is not installed.
 
@@ -116,7 +116,7 @@ def read_configurations(
         raise InputError(f"Landmarks have 2 or 3 dimensions, not {dimensions}; correct --dimensions.")
     raw = _read_folder(path, curve_points) if path.is_dir() else _read_file(path, name, curve_points, dimensions)
     if dimensions not in (None, raw.dimensions):
-        raise InputError(f"{path} has landmarks in {raw.dimensions}-D; leave --dimensions {dimensions} out.")
+        raise InputError(f"{path} has landmarks in {raw.dimensions}-D; omit --dimensions {dimensions}.")
     for file in sliders:
         form = "before, slide, after, or one landmark on the surface,"
         numbers = read_landmark_numbers(file, raw.landmarks, (1, 3), form) - 1
@@ -134,14 +134,14 @@ def _read_file(
     single = next((ending for ending in (*_SINGLE, *_LINES) if path.name.lower().endswith(ending)), None)
     if not (suffix in (*_MANY, *_TABLES, *R_ENDINGS) or single):
         endings = ", ".join(dict.fromkeys((*_MANY, *_TABLES, *R_ENDINGS, *_SINGLE, *_LINES)))
-        raise damage_error(path, f"the ending {suffix!r} is none of landmark files ({endings})")
+        raise damage_error(path, f"the ending {suffix!r} is not that of a landmark file ({endings})")
     data = read_bytes(path, LARGEST_CONFIGURATIONS_FILE_BYTES)
     if not data.strip():
         raise damage_error(path, "it is empty; export or copy it again")
     if suffix in R_ENDINGS:
         return parse_r(data, path, name)
     if name is not None:
-        raise InputError(f"{path} is no file of R, whose arrays have names; leave --object out.")
+        raise InputError(f"{path} is not an R file, whose arrays have names; omit --object.")
     is_morphologika = _is_morphologika(data)
     if suffix in _MANY or is_morphologika or re.match(rb"\s*LM3?\s*=", data, re.IGNORECASE):
         try:
@@ -159,7 +159,7 @@ def _read_file(
 
 
 def is_configurations(path: Path | str) -> bool:
-    """Return whether a path is landmarks of many specimens by its ending, header, or the files in a folder."""
+    """Return whether a path contains landmarks of many specimens, by its ending, header, or the files in a folder."""
     path = Path(path)
     if path.is_dir():
         names = [file.name.lower() for file in path.iterdir()]
@@ -203,8 +203,8 @@ def _read_specimen(path: Path, ending: str) -> LandmarkConfigurations:
     if ending in _LINES:
         mesh, lines = read_vtk_lines(data, path)
         if not lines:
-            raise damage_error(path, "it has no lines, which would be curves; give landmarks, or surfaces to a command "
-                               "that takes surfaces")  # fmt: skip
+            raise damage_error(path, "it has no lines, which would be curves; give landmarks, or use a command "
+                               "for surfaces")  # fmt: skip
         points, labels = mesh.vertices[[k for line, _ in lines for k in line]], ()
         curves = consecutive_curves(0, [line for line, _ in lines], [closed for _, closed in lines])
         notes += [note for note in mesh.notes if note != LINE_NOTE]
@@ -229,7 +229,7 @@ def _read_specimen(path: Path, ending: str) -> LandmarkConfigurations:
 
 
 def _is_other_table(file: Path) -> bool:
-    """Return whether a CSV file is of something else than landmarks, such as covariates, by its first line."""
+    """Return whether the first line of a CSV file indicates other data than landmarks, such as covariates."""
     row = next(iter(csv_rows(read_bytes(file, LARGEST_CONFIGURATIONS_FILE_BYTES), file)), list[str]())
     return bool(row) and not header_kind(row) and not any(map(is_number, row[1:4]))
 
@@ -238,7 +238,7 @@ def _read_folder(folder: Path, curve_points: int | None) -> LandmarkConfiguratio
     """Return the landmarks in the files of the most frequent ending, in the order of the first file."""
     if (folder / RECORD).is_file():
         raise InputError(
-            f"{folder} is a folder that align wrote; give the landmark file that it was made from, or write its shapes "
+            f"{folder} is a folder that align wrote; give the original landmark file, or write its shapes "
             "to a landmark file with shapespace export."
         )
     endings = (*_MANY, *_SINGLE, *_LINES)
@@ -249,11 +249,11 @@ def _read_folder(folder: Path, curve_points: int | None) -> LandmarkConfiguratio
             files.setdefault(ending, []).append(file)
     if all(ending == ".csv" and all(map(_is_other_table, listed)) for ending, listed in files.items()):
         raise damage_error(folder, f"it has no landmark files, which end with {', '.join(endings)} (.csv: name,x,y,z)")
-    # Files of VTK are surfaces where there are others, and Slicer's markups first among equally many: they mark missing
-    # landmarks.
-    ending = max(files, key=lambda one: (one not in _LINES, len(files[one]), one == ".mrk.json"))
+    # VTK files are surfaces if there are other files. Among equally frequent endings, markups of Slicer are preferred,
+    # because they mark missing landmarks.
+    ending = max(files, key=lambda end: (end not in _LINES, len(files[end]), end == ".mrk.json"))
     others = [file.name for other, listed in files.items() if other != ending for file in listed]
-    notes = [f"{len(others)} files without {ending} are left out ({first_names(others)})."] if others else []
+    notes = [f"{len(others)} files without {ending} are skipped ({first_names(others)})."] if others else []
     parts = _join_files(
         [_read_file(file, None) if ending in _MANY else _read_specimen(file, ending) for file in files[ending]]
     )
@@ -271,12 +271,12 @@ def _read_folder(folder: Path, curve_points: int | None) -> LandmarkConfiguratio
     for part in rest:
         file, place = Path(part.where), {name: k for k, name in enumerate(part.landmarks)}
         if part.dimensions != first.dimensions or place.keys() != set(first.landmarks):
-            has, expected = (f"{len(one.landmarks)} landmarks in {one.dimensions}-D" for one in (part, first))
+            has, expected = (f"{len(config.landmarks)} landmarks in {config.dimensions}-D" for config in (part, first))
             other = first_names(sorted(place.keys() ^ set(first.landmarks)))
             raise damage_error(
                 file, f"it has {has} and {Path(first.where).name} has {expected}"
-                f"{f' ({other} in one of them alone)' if other else ''}; give the same landmarks to all files, with NA "
-                "or as undefined where one is missing"
+                f"{f' ({other} in only one file)' if other else ''}; give the same landmarks to all files, with NA "
+                "or as undefined if one is missing"
             )  # fmt: skip
         points.append(part.points[:, [place[name] for name in first.landmarks]])
     keys = dict.fromkeys(key for part in parts for key in part.columns)
@@ -291,21 +291,23 @@ def _read_folder(folder: Path, curve_points: int | None) -> LandmarkConfiguratio
 
 
 def _prefixes(part: LandmarkConfigurations) -> dict[int, tuple[int, str, str]]:
-    """Return landmark -> its curve, -1 for none, and the parts before and of the number in its label, such as `F-1`."""
+    """Return landmark -> curve (-1 for none), and prefix and number of its label, such as `F-1`."""
     curve = {point: k for k, (points, _) in enumerate(part.curves) for point in points}
     found = {k: re.fullmatch(r"(|.*[-_ ])(\d+)", label) for k, label in enumerate(part.landmarks)}
     return {k: (curve.get(k, -1), match[1], match[2]) for k, match in found.items() if match}
 
 
 def _with_labels_of(first: LandmarkConfigurations, part: LandmarkConfigurations) -> LandmarkConfigurations:
-    """Return a part with the labels of the first where they differ before the number alone.
+    """Return a part with the labels of the first part if they differ only in the prefix before the number.
 
-    3D Slicer calls points as their node and a number by default, and nodes of one name get `_1`, `_2` and so on. Lists
-    and curves are matched by their order.
+    By default, 3D Slicer names points by their node and a number, and appends `_1`, `_2` and so on to nodes of the same
+    name. Lists and curves are matched by their order.
     """
     theirs, own = (
-        sorted(dict.fromkeys((curve, prefix) for curve, prefix, _ in _prefixes(one).values()), key=lambda key: key[0])
-        for one in (first, part)
+        sorted(
+            dict.fromkeys((curve, prefix) for curve, prefix, _ in _prefixes(source).values()), key=lambda key: key[0]
+        )
+        for source in (first, part)
     )
     new = {key: prefix for key, (_, prefix) in zip(own, theirs, strict=False) if key[1] != prefix}
     is_shared = {prefix for _, prefix in new} & {prefix for _, prefix in theirs}
@@ -320,11 +322,11 @@ def _with_labels_of(first: LandmarkConfigurations, part: LandmarkConfigurations)
 def _with_equal_curves(
     parts: Sequence[LandmarkConfigurations], path: Path, count: int | None
 ) -> list[LandmarkConfigurations]:
-    """Return parts whose curves have the same numbers of points, after the other landmarks, or `count` of them."""
+    """Return parts whose curves have equal numbers of points, `count` if given, and follow the other landmarks."""
     names = [[re.sub(r"\d+$", "", part.landmarks[points[0]]) for points, _ in part.curves] for part in parts]
     curves = list[Sequence[Curve]]()
     for part, own in zip(parts, names, strict=True):
-        # Curves of the same names may be in another order.
+        # Curves with the same names may be in different order.
         rank = [names[0].index(name) if set(own) == set(names[0]) else 0 for name in own]
         curves.append([part.curves[int(k)] for k in np.argsort(rank, kind="stable")])
     closed = [is_closed for _, is_closed in curves[0]]
@@ -351,7 +353,7 @@ def _with_equal_curves(
 
 
 def _join_files(parts: Sequence[LandmarkConfigurations]) -> Sequence[LandmarkConfigurations]:
-    """Return one part of each specimen where files such as NAME_a and NAME_b have its landmarks and its curves."""
+    """Return one part per specimen; files such as NAME_a and NAME_b with its landmarks and its curves are joined."""
     points = sorted((re.escape(part.names[0]) for part in parts if not part.curves), key=len, reverse=True)
     own_names = rf"(?P<name>{'|'.join(points)})(?:[ ._-](?P<kind>.+))?"
     for pattern in (own_names, *_SPECIMEN_OF_FILE) if all(len(part) == 1 for part in parts) else ():
@@ -363,12 +365,12 @@ def _join_files(parts: Sequence[LandmarkConfigurations]) -> Sequence[LandmarkCon
         is_mixed = all({bool(part.curves) for part in own} == {True, False} for own in groups.values())
         is_complete = sum(map(len, groups.values())) == len(parts)
         if is_mixed and is_complete and len({frozenset(own) for own in kinds.values()}) == 1:
-            return [_joined(name, sorted(own, key=lambda one: bool(one.curves))) for name, own in groups.items()]
+            return [_join_parts(name, sorted(own, key=lambda part: bool(part.curves))) for name, own in groups.items()]
     return parts
 
 
-def _joined(name: str, parts: Sequence[LandmarkConfigurations]) -> LandmarkConfigurations:
-    """Return the landmarks of one specimen from several files; labels of several files get the name of their file."""
+def _join_parts(name: str, parts: Sequence[LandmarkConfigurations]) -> LandmarkConfigurations:
+    """Return the landmarks of one specimen from several files; labels that occur in several files get a file prefix."""
     counts = Counter(label for part in parts for label in part.landmarks)
     starts = np.cumsum([0, *(len(part.landmarks) for part in parts)]).tolist()
     return replace(
@@ -399,15 +401,15 @@ def slider_texts(raw: LandmarkConfigurations) -> dict[str, str]:
 
 
 def write_configurations(path: Path | str, raw: LandmarkConfigurations, format: str | None = None) -> tuple[str, ...]:
-    """Write the landmarks of many specimens, and return sentences on what the format cannot hold.
+    """Write the landmarks of many specimens, and return notes on data that the format cannot store.
 
     Args:
-        path: the file; a folder for the formats of `FOLDER_FORMATS`.
-        raw: the landmarks; sliders are not written.
-        format: one of `CONFIGURATION_FORMATS` or `FOLDER_FORMATS`; None for that of the ending of `path`.
+        path: path of the file, or of a folder for the formats of `FOLDER_FORMATS`.
+        raw: landmarks of the specimens; sliders are not written.
+        format: one of `CONFIGURATION_FORMATS` or `FOLDER_FORMATS`; None for the format of the ending of `path`.
 
     Raises:
-        InputError: an unknown format, or one that cannot hold these landmarks.
+        InputError: the format is unknown, or cannot store these landmarks.
         FileError: it cannot be written.
 
     Example:
@@ -428,7 +430,7 @@ def write_configurations(path: Path | str, raw: LandmarkConfigurations, format: 
     notes: list[str] = []
     held = raw.columns if format in ("csv", "long", "morphoj") else _TPS_KEYS if format == "tps" else ()
     if lost := [column for column in raw.columns if column not in held]:
-        notes.append(f"Columns of the table ({', '.join(lost)}) are left out, since the format {format} has none.")
+        notes.append(f"Columns of the table ({', '.join(lost)}) are omitted, since the format {format} has no columns.")
     if format == "morphoj" and raw.columns:
         notes.append(f"The columns are in {list(texts)[1].name}; import it as classifier variables.")
     numbers = tuple(map(str, range(1, len(raw.landmarks) + 1)))
@@ -440,7 +442,7 @@ def write_configurations(path: Path | str, raw: LandmarkConfigurations, format: 
 def _texts(path: Path, raw: LandmarkConfigurations, format: str) -> dict[Path, str]:
     if format == "tps":
         if bad := [name for name in raw.names if "\n" in name or "\r" in name]:
-            raise InputError(f"{raw.where}: TPS cannot hold the specimen name {bad[0][:60]!r}; rename it.")
+            raise InputError(f"{raw.where}: TPS cannot store the specimen name {bad[0][:60]!r}; rename it.")
         # A line break would end the value.
         values = {k.upper(): [" ".join(c.split()) for c in raw.columns.get(k, [""] * len(raw))] for k in _TPS_KEYS}
         return {path: tps_text(dict(zip(raw.names, raw.points, strict=True)), values)}
@@ -453,12 +455,12 @@ def _texts(path: Path, raw: LandmarkConfigurations, format: str) -> dict[Path, s
 
 def _texts_in_folder(folder: Path, raw: LandmarkConfigurations, format: str) -> dict[Path, str]:
     if raw.dimensions != 3:
-        raise InputError(f"{raw.where}: .{format} files cannot hold 2-D landmarks; write tps, nts or csv.")
+        raise InputError(f"{raw.where}: .{format} files cannot store 2-D landmarks; write tps, nts or csv.")
     if format == "fcsv" and not raw.observed.all():
-        raise InputError(f"{raw.where}: .fcsv files cannot hold missing landmarks; write mrk.json.")
+        raise InputError(f"{raw.where}: .fcsv files cannot store missing landmarks; write mrk.json.")
     bad = next((name for name in raw.names if re.search(r'[/\\:*?"<>|\x00-\x1f]|^\.', name)), None)
     if bad is not None:
-        raise InputError(f"{raw.where}: the specimen name {bad[:60]!r} cannot name a file; rename it.")
+        raise InputError(f"{raw.where}: the specimen name {bad[:60]!r} is not a valid file name; rename it.")
     write = LANDMARK_FORMATS[f".{format}"].write
-    marks = (dict(zip(raw.landmarks, points, strict=True)) for points in raw.points)
-    return {folder / f"{name}.{format}": write(one) for name, one in zip(raw.names, marks, strict=True)}
+    specimens = (dict(zip(raw.landmarks, points, strict=True)) for points in raw.points)
+    return {folder / f"{name}.{format}": write(landmarks) for name, landmarks in zip(raw.names, specimens, strict=True)}

@@ -21,7 +21,7 @@ from shapespace.types import FloatArray
 _AXIS_FIRST = re.compile(r"([xyz])[ ._-]?(\d+)", re.IGNORECASE)
 _AXIS_LAST = re.compile(r"(.*\d|.+?)(?:(?<=\d)|[ ._-])([xyz])", re.IGNORECASE)
 _NUMBERED = re.compile(r"(?:(?:raw|proc)[ ._-]?)?coord[ ._-]?\d+", re.IGNORECASE)
-"""Columns of coordinates of MorphoJ, whose names have no axis."""
+"""Names of coordinate columns of MorphoJ, which do not contain the axis."""
 _LANDMARK = ("landmark", "landmarks", "lm", "point", "semilandmark")
 _KEYS = (*KEYS, "individual", "label", "identifier")
 
@@ -33,14 +33,14 @@ def header_kind(header: Sequence[str]) -> str:
         if key_column(header, _LANDMARK) is None:
             return "single" if key_column(header) == 0 and "z" in lower else ""
         return "long"
-    # Tables of coefficients have columns z1, z2, ... alone.
+    # Tables of coefficients have only columns z1, z2, ...
     return "wide" if sum({"x", "y"} <= set(axes) for axes in _landmark_columns(header).values()) > 1 else ""
 
 
 def _landmark_columns(header: Sequence[str], width: int | None = None) -> dict[str, dict[str, int]]:
     """Return landmark -> axis -> column for the styles x1, X.1, 1.X, 1X, lm1_x and nose_x.
 
-    Coordinates of MorphoJ, which are numbered, have the given width; None for that of their number, 3 before 2.
+    Numbered coordinates of MorphoJ have `width` dimensions; None for 3 if their number allows, or else 2.
     """
     columns: dict[str, dict[str, int]] = {}
     if numbered := [column for column, name in enumerate(header) if _NUMBERED.fullmatch(name.strip())]:
@@ -64,9 +64,9 @@ def parse_table(content: bytes, path: Path, dimensions: int | None = None) -> La
     """Return the landmarks in a wide or long table (CSV, tab-separated or Excel), with its other columns.
 
     Args:
-        content: the file.
-        path: for messages.
-        dimensions: 2 or 3, of coordinates of MorphoJ whose number fits both.
+        content: content of the file.
+        path: path of the file, used in messages.
+        dimensions: dimension of the space, 2 or 3, for a MorphoJ table whose number of coordinates fits both.
     """
     header, *rows = read_rows(path, content)
     kind = header_kind(header)
@@ -83,24 +83,26 @@ def parse_table(content: bytes, path: Path, dimensions: int | None = None) -> La
         raise damage_error(path, f"its {count} columns of coordinates of MorphoJ {fits}; {advice}, and so on")
     if not rows:
         raise damage_error(path, "it has no specimens below its header")
-    return mark_missing(_long(header, rows, path) if kind == "long" else _wide(header, rows, path, dimensions))
+    return mark_missing(
+        _read_long(header, rows, path) if kind == "long" else _read_wide(header, rows, path, dimensions)
+    )
 
 
 def _axes(columns: Mapping[str, Mapping[str, int]], path: Path) -> str:
-    axes = "xyz" if any("z" in one for one in columns.values()) else "xy"
-    for label, one in columns.items():
-        if lacking := set(axes) - set(one):
+    axes = "xyz" if any("z" in landmark for landmark in columns.values()) else "xy"
+    for label, landmark in columns.items():
+        if lacking := set(axes) - set(landmark):
             advice = "do not mix 2-D and 3-D landmarks" if lacking == {"z"} else "add it"
             raise damage_error(path, f"landmark {label[:40]!r} has no column for its {min(lacking)}; {advice}")
     return axes
 
 
-def _wide(
+def _read_wide(
     header: Sequence[str], rows: Sequence[Sequence[str]], path: Path, dimensions: int | None
 ) -> LandmarkConfigurations:
     columns = _landmark_columns(header, dimensions)
     labels, width = tuple(columns), _axes(columns, path)
-    used = [one[axis] for one in columns.values() for axis in width]
+    used = [landmark[axis] for landmark in columns.values() for axis in width]
     key = 0 if header[0].lower() in _KEYS else key_column(header, _KEYS)
     if key is None and 0 not in used and (not header[0] or len({row[0] for row in rows}) == len(rows)):
         key = 0
@@ -121,17 +123,17 @@ def _wide(
     )
 
 
-def _long(header: Sequence[str], rows: Sequence[Sequence[str]], path: Path) -> LandmarkConfigurations:
+def _read_long(header: Sequence[str], rows: Sequence[Sequence[str]], path: Path) -> LandmarkConfigurations:
     lower = [name.lower() for name in header]
     key = 0 if lower[0] in _KEYS else key_column(header, _KEYS)
     landmark = lower.index(next(name for name in _LANDMARK if name in lower))
     if key is None:
-        raise damage_error(path, f"its header names no specimen ({', '.join(header)[:60]}); add the column specimen")
+        raise damage_error(path, f"its header names no specimens ({', '.join(header)[:60]}); add the column specimen")
     axes = [lower.index(axis) for axis in "xyz" if axis in lower]
     pairs = [(row[key], row[landmark]) for row in rows]
     if repeated := [pair for pair, count in Counter(pairs).items() if count > 1]:
         name, label = repeated[0]
-        raise damage_error(path, f"specimen {name[:40]!r} has two rows of landmark {label[:40]!r}, so remove one")
+        raise damage_error(path, f"specimen {name[:40]!r} has two rows of landmark {label[:40]!r}; remove one")
     names, labels = (tuple(dict.fromkeys(pair[k] for pair in pairs)) for k in (0, 1))
     absent = len(names) * len(labels) - len(pairs)
     if absent > len(pairs):
@@ -148,7 +150,7 @@ def _long(header: Sequence[str], rows: Sequence[Sequence[str]], path: Path) -> L
             if len(values) == len(names):
                 columns[head] = tuple(dict(values)[name] for name in names)
             else:
-                notes.append(f"The column {head} is left out, since it differs between the landmarks of a specimen.")
+                notes.append(f"The column {head} is omitted, since it differs between the landmarks of a specimen.")
     if absent:
         lacking = [name for name, count in Counter(name for name, _ in pairs).items() if count < len(labels)]
         nouns = "landmark without a row is" if absent == 1 else "landmarks without a row are"
@@ -163,7 +165,7 @@ def _cells(points: FloatArray) -> list[str]:
 
 
 def wide_text(raw: LandmarkConfigurations) -> str:
-    """Return a table with a row for each specimen: name, columns, coordinates as `two.d.array` of geomorph has them."""
+    """Return a table with a row for each specimen: name, columns, and coordinates as in geomorph's `two.d.array`."""
     coordinates = [f"{label}.{axis}" for label in raw.landmarks for axis in "XYZ"[: raw.dimensions]]
     header = ["name", *raw.columns, *coordinates]
     repeated = next((name for name, count in Counter(header).items() if count > 1), None)

@@ -20,14 +20,14 @@ from shapespace.types import BoolArray, FloatArray, IntArray
 NO_SLIDERS = np.zeros((0, 3), dtype=np.int32)
 _NO_POINTS = np.zeros(0, dtype=np.int32)
 Curve: TypeAlias = tuple[tuple[int, ...], bool]
-"""Numbers of the points along a curve, from 0, and whether the first point follows the last."""
+"""Indices of the points along a curve, from 0, and whether it is closed (the first point follows the last)."""
 _MOST_CURVE_POINTS = 100
-"""Points of a resampled curve by default; lines between them are within 0.4 % of the size (RMS) of the original in 99
-sections of femora and spleens."""
-_MOST_DIGITS = 9  # of a number of a landmark, which fits 32 bits
+"""Default number of points of a resampled curve; the RMS distance of its lines from the original is at most 0.4 % of
+the size, measured on 99 sections of femora and spleens."""
+_MOST_DIGITS = 9  # digits of the number of a landmark, which fits 32 bits
 _MISSING_CODES, _MISSING_BELOW_ZERO = (-999.0, -9999.0), (-1.0, -9.0, -99.0)
-"""All coordinates of a missing landmark; the latter only where no other coordinate is negative, as in pictures. tpsDig
-writes -1, and older programs -999."""
+"""Value of all coordinates of a missing landmark; the latter only if no other coordinate is negative, as in pictures.
+tpsDig writes -1, and older programs -999."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -35,16 +35,16 @@ class LandmarkConfigurations:
     """Landmarks of N specimens as read, each in its own pose and size.
 
     Args:
-        names: N specimens, all different.
+        names: N names of specimens, all different.
         points: (N, L, D) coordinates with D 2 or 3; missing landmarks are not-a-number.
-        landmarks: L names; their numbers from 1 where a file has none.
-        columns: name -> N cells of covariates in the file; a missing one is empty.
-        curve_sliders: (M, 3) landmarks before, sliding and after, from 0; those of `curves` by default.
-        surface_sliders: (S,) landmarks that slide on the surface, from 0.
-        curves: curves of the file. The start of a closed one, and the direction of all, may differ between specimens.
-        unit: of the coordinates, `mm` or empty for none.
-        where: what the data are called in messages, such as the file.
-        notes: what was changed or left out while reading, a sentence each.
+        landmarks: L names of landmarks; their numbers from 1 if the file has no names.
+        columns: name -> N cells of covariates in the file; missing values are empty.
+        curve_sliders: (M, 3) indices, from 0, of the landmarks before, sliding and after; those of `curves` by default.
+        surface_sliders: (S,) indices, from 0, of the landmarks that slide on the surface.
+        curves: curves of the file. The start of closed curves, and the direction of all, may differ between specimens.
+        unit: unit of the coordinates, `mm`, or empty if unknown.
+        where: name of the data in messages, such as the file.
+        notes: sentences about changed or omitted data.
 
     Example:
         >>> points = np.stack([mesh.vertices[:4] for mesh in meshes])
@@ -77,26 +77,26 @@ class LandmarkConfigurations:
             raise InputError(f"{self.where}: there are {len(self.landmarks)} names for {shape[1]} landmarks.")
         repeated = next((name for name, count in Counter(self.names).items() if count > 1), None)
         if repeated is not None:
-            raise InputError(f"{self.where}: two specimens are called {repeated[:60]!r}; rename one of them.")
+            raise InputError(f"{self.where}: two specimens are called {repeated[:60]!r}; rename one.")
         if not all(name.strip() for name in self.names):
-            raise InputError(f"{self.where}: a specimen has no name; name all of them.")
+            raise InputError(f"{self.where}: a specimen has no name; name all specimens.")
 
     def __len__(self) -> int:
         return len(self.names)
 
     @property
     def dimensions(self) -> int:
-        """2 or 3."""
+        """Dimension of the space, 2 or 3."""
         return int(self.points.shape[2])
 
     @property
     def curve_links(self) -> tuple[tuple[int, int], ...]:
-        """Pairs of neighbours along the curves, numbers from 1."""
+        """Pairs of neighbouring landmarks along the curves, numbered from 1."""
         return tuple((a + 1, b + 1) for points, closed in self.curves for a, b in pairwise(_ring(points, closed)))
 
     @property
     def observed(self) -> BoolArray:
-        """(N, L) whether a landmark is there."""
+        """(N, L) mask of landmarks that are not missing."""
         return np.logical_not(np.logical_or.reduce(np.isnan(self.points), axis=2))
 
 
@@ -105,7 +105,7 @@ def _ring(points: tuple[int, ...], closed: bool) -> tuple[int, ...]:
 
 
 def _sliders_of_curves(curves: Sequence[Curve]) -> IntArray:
-    """Return (M, 3) the points before, sliding and after: all but ends of open curves and starts of closed ones."""
+    """Return indices (M, 3) of points before, sliding, after; ends of open and starts of closed curves do not slide."""
     rings = [_ring(points, closed) for points, closed in curves]
     triples = [triple for ring in rings for triple in zip(ring, ring[1:], ring[2:], strict=False)]
     return np.reshape(triples, (-1, 3)).astype(np.int32)
@@ -114,7 +114,7 @@ def _sliders_of_curves(curves: Sequence[Curve]) -> IntArray:
 def consecutive_curves(
     start: int, curves: Sequence[Sequence[object] | FloatArray], are_closed: Sequence[bool]
 ) -> tuple[Curve, ...]:
-    """Return the numbers of the points of curves that follow each other after `start` landmarks."""
+    """Return the curves whose points follow each other after the first `start` landmarks."""
     ends = np.cumsum([start, *map(len, curves)]).tolist()
     spans = (tuple(range(*span)) for span in pairwise(ends))
     return tuple(zip(spans, are_closed, strict=True))
@@ -124,23 +124,23 @@ def equal_curves(
     curves: Sequence[Sequence[FloatArray]], are_closed: Sequence[bool], names: Sequence[str], path: Path,
     count: int | None = None,
 ) -> tuple[list[list[FloatArray]], tuple[str, ...]]:  # fmt: skip
-    """Return the curves of N specimens with the same numbers of points, and notes on those that are resampled.
+    """Return the curves of N specimens with equal numbers of points, and notes on those that are resampled.
 
     Curves with equal numbers stay as they are, unless closed ones have more than the default.
 
     Args:
-        curves: of each specimen, C polylines (K, D); not-a-number for missing points.
-        are_closed: of each curve, whether its first point follows the last.
-        names: of the specimens.
-        path: for messages.
-        count: points of each curve; None for the least number of a specimen, at most 100.
+        curves: N specimens with C polylines (K, D) each; not-a-number for missing points.
+        are_closed: C values, whether the first point of a curve follows its last point.
+        names: N names of specimens, used in messages.
+        path: path of the file, used in messages.
+        count: number of points of each curve; None for the smallest number among the specimens, at most 100.
 
     Raises:
-        FileFormatError: a curve that has to be resampled is a point alone.
+        FileFormatError: a curve that has to be resampled has fewer than two points.
     """
     notes, out = list[str](), [list[FloatArray]() for _ in curves]
     for place, (closed, own) in enumerate(zip(are_closed, zip(*curves, strict=True), strict=True), 1):
-        # Contours often end with the point that they begin with.
+        # The last point of a contour is often equal to its first point.
         own = [curve[:-1] if closed and len(curve) > 1 and (curve[0] == curve[-1]).all() else curve for curve in own]
         numbers = sorted(set(map(len, own)))
         points = count or min(numbers[0], _MOST_CURVE_POINTS)
@@ -152,7 +152,7 @@ def equal_curves(
                         f"Cannot read {path}: curve {place} of specimen {name[:60]!r} has one point or none, and "
                         f"{numbers[-1]} in another; digitise the same curves for all."
                     )
-            own = [_spaced(seen, points, closed) if len(seen) else curve[:1].repeat(points, 0)
+            own = [_resample_polyline(seen, points, closed) if len(seen) else curve[:1].repeat(points, 0)
                    for curve, seen in zip(own, known, strict=True)]  # fmt: skip
             had = " to ".join(map(str, dict.fromkeys((numbers[0], numbers[-1]))))
             kind = "Closed curve" if closed else "Curve"
@@ -162,22 +162,22 @@ def equal_curves(
     return out, tuple(notes)
 
 
-def _spaced(path: FloatArray, count: int, closed: bool) -> FloatArray:
-    """Return points of a polyline at equal distances from its first point; the end of an open one is among them."""
+def _resample_polyline(path: FloatArray, count: int, closed: bool) -> FloatArray:
+    """Return `count` points of a polyline at equal distances from its first point, including the end of an open one."""
     return spaced_points(np.concatenate([path, path[:1]]), count + 1)[:-1] if closed else spaced_points(path, count)
 
 
 def spaced_points(path: FloatArray, count: int) -> FloatArray:
-    """Return `count` points of a polyline (M, D) at equal distances along it, ends included."""
+    """Return `count` points of a polyline (M, D) at equal distances along it, including both ends."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     at: FloatArray = np.linspace(0.0, float(along[-1]), count)
     return np.stack([np.interp(at, along, path[:, axis]) for axis in range(path.shape[1])], axis=1)
 
 
 def mark_missing(raw: LandmarkConfigurations) -> LandmarkConfigurations:
-    """Return landmarks with not-a-number for all coordinates of missing ones, and notes on them.
+    """Return the configurations with not-a-number for all coordinates of missing landmarks, and notes on these.
 
-    A landmark is missing if one of its coordinates is not-a-number, or all are one of the codes of digitising programs.
+    A landmark is missing if a coordinate is not-a-number, or if all are equal to a code of digitising programs.
     """
     points, notes = raw.points.copy(), list(raw.notes)
     lacking = np.isnan(points)
@@ -190,32 +190,32 @@ def mark_missing(raw: LandmarkConfigurations) -> LandmarkConfigurations:
     coded = np.isin(first, codes)
     points[coded] = np.nan
     for mask, reason in (
-        (partly, "with a part of the coordinates"),
+        (partly, "with some coordinates only"),
         (coded, f"with the coordinates {' or '.join(f'{code:g}' for code in codes)}"),
     ):
         if mask.any():
             affected = [raw.names[int(row)] for row in np.unique(np.nonzero(mask)[0])]
             count = int(mask.sum())
             noun, verb = ("landmark", "is") if count == 1 else ("landmarks", "are")
-            notes.append(f"{count} {noun} of {first_names(affected)} {reason} {verb} taken as missing.")
+            notes.append(f"{count} {noun} of {first_names(affected)} {reason} {verb} interpreted as missing.")
     return replace(raw, points=points, notes=tuple(notes))
 
 
 def read_landmark_numbers(path: Path, landmarks: Sequence[str] | None, widths: Sequence[int], form: str) -> IntArray:
-    """Return the numbers, from 1, of the landmarks in each row of a table with a header or without.
+    """Return the numbers, from 1, of the landmarks in each row of a table with or without a header.
 
     Args:
-        path: of the table; it has numbers from 1, or names.
-        landmarks: L names; None if they are not known.
-        widths: numbers of columns that it may have; row names of R are left out.
-        form: of its rows, for messages.
+        path: path of the table, which contains numbers from 1, or names.
+        landmarks: L names of landmarks; None if they are unknown.
+        widths: allowed numbers of columns; row names of R are ignored.
+        form: description of its rows, used in messages.
 
     Returns:
-        (M, width), all different in a row.
+        Numbers (M, width), all different within a row.
 
     Raises:
         FileError: it cannot be read.
-        FileFormatError: it has no rows, or one of another form.
+        FileFormatError: it has no rows, or a row has another form.
     """
     number = {name: k for k, name in enumerate(landmarks or (), 1)}
 

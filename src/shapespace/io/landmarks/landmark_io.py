@@ -24,12 +24,12 @@ from shapespace.io.volume_io import MM_OF_UNITS
 from shapespace.types import RAS_TO_LPS, FloatArray, SurfaceLandmarks
 
 Pairs: TypeAlias = Iterable[tuple[str, FloatArray | None]]
-"""Names and points (3,) in the order of a file; None for a landmark that is marked as absent."""
-# A label names each of its points, so a long one would be there as often as it has points.
+"""Names and points (3,) in the order of a file; None as the point of a landmark that is marked as absent."""
+# A label is repeated for each of its points, so a long label would take much memory.
 _LONGEST_LABEL = 256
 _VERTEX = "vertex"
 """Column of regions."""
-_DIGITS = 10  # of the number of a vertex, which fits into int32
+_DIGITS = 10  # digits of the number of a vertex, which fits into int32
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,9 @@ class LandmarkFormat:
     """A file format for named points.
 
     Args:
-        name: what people call it.
-        read: (content, path) -> names and points, in the file's order, names not yet checked.
-        write: names and points -> text.
+        name: common name of the format.
+        read: function (content, path) -> names and points in the order of the file; the names are not yet checked.
+        write: function names and points -> text.
     """
 
     name: str
@@ -48,22 +48,23 @@ class LandmarkFormat:
 
 
 def read_landmarks(path: Path | str, *, keep_absent: bool = False) -> dict[str, FloatArray]:
-    """Read named points, in the file's own frame and unit; those marked as absent are left out.
+    """Read named points, in the frame and unit of the file; points that are marked as absent are omitted.
 
-    menpo `.ljson` names groups of points, not points: the points of a label with several are called `label_0`,
-    `label_1`, ... by their position in the label (absent ones count), a label's only point is called as the label,
-    points of no label `point_0`, ... by their position in the file; with several groups, `group_` comes before. 3D
-    Slicer files (`.mrk.json`, `.fcsv`) are returned in LPS, the frame in which Slicer saves meshes: RAS, in which
-    an `.fcsv` is that does not say, is turned by changing the sign of x and y. CSV is `name,x,y,z`, with or without
-    that header, `#` for comments. The points of BU-3DFE (`.bnd`, a vertex number and x y z in each row) have no
-    names: they are called `point_0`, ... by their position in the file, as those of `.tps` are, and of the plain
-    rows `x y z` in `.txt` and `.pts` that have no name before them. Bosphorus (`.lm3`) and scalismo (`.tlms`) name
-    their points.
+    Files of menpo (`.ljson`) name groups of points, not points. If a label has several points, these are named
+    `label_0`, `label_1`, ... by their position in the label, including absent points; the only point of a label has the
+    name of the label. Points without a label are named `point_0`, ... by their position in the file. With several
+    groups, the prefix `group_` is added.
+
+    Files of 3D Slicer (`.mrk.json`, `.fcsv`) are returned in LPS, the frame in which Slicer saves meshes: RAS, which is
+    the default of `.fcsv`, is converted by changing the signs of x and y. CSV is `name,x,y,z`, with or without this
+    header, and `#` begins a comment. The points of BU-3DFE (`.bnd`, a vertex number and x y z in each row) and `.tps`,
+    and rows `x y z` without a name in `.txt` and `.pts`, are named `point_0`, ... by their position in the file.
+    Bosphorus (`.lm3`) and scalismo (`.tlms`) name their points.
 
     Args:
-        path: a file with one of the endings in `LANDMARK_FORMATS` or `READ_ONLY_LANDMARKS`; the kind of a
-            `.json` is determined from its content.
-        keep_absent: return not-a-number for landmarks that are marked as absent.
+        path: path of a file with one of the endings in `LANDMARK_FORMATS` or `READ_ONLY_LANDMARKS`; the format of a
+            `.json` file is determined from its content.
+        keep_absent: whether to return not-a-number for landmarks that are marked as absent.
 
     Returns:
         name -> (3,) float64, in the file's order.
@@ -71,7 +72,7 @@ def read_landmarks(path: Path | str, *, keep_absent: bool = False) -> dict[str, 
     Raises:
         FileError: it does not exist, cannot be read, or is longer than `LARGEST_LANDMARK_FILE_BYTES`.
         FileFormatError: it is not in that format, or has a name twice, numbers that are not finite, or no
-            landmarks at all.
+            landmarks.
     """
     path = Path(path)
     read = READ_ONLY_LANDMARKS.get(path.suffix.lower()) or _format(path, "read").read
@@ -88,18 +89,19 @@ def read_landmarks(path: Path | str, *, keep_absent: bool = False) -> dict[str, 
             raise damage_error(path, f"landmark '{name[:60]}' has a coordinate that is not finite, so remove it")
         landmarks[name] = np.full(3, np.nan) if point is None else point
     if not landmarks:
-        raise damage_error(path, "it holds no landmarks")
+        raise damage_error(path, "it contains no landmarks")
     return landmarks
 
 
 def write_landmarks(path: Path | str, landmarks: Mapping[str, FloatArray]) -> None:
-    """Write named points in the format of the ending of `path`, whole or not at all, exactly.
+    """Write named points exactly, in the format of the ending of `path`, atomically.
 
-    3D Slicer files say LPS and mm; a `.json` without `.mrk` is scalismo's; in `.ljson` each point is a label.
+    Files of 3D Slicer declare LPS and mm; `.json` without `.mrk` is the format of scalismo; in `.ljson` each point has
+    its own label.
 
     Args:
-        path: the file, with one of the endings in `LANDMARK_FORMATS`.
-        landmarks: name -> (3,) float64; for Slicer in LPS and millimetres.
+        path: path of the file, with one of the endings in `LANDMARK_FORMATS`.
+        landmarks: name -> (3,) float64 coordinates; in LPS and millimetres for Slicer.
 
     Raises:
         InputError: a point that is not three finite numbers, or a name that is empty.
@@ -116,7 +118,7 @@ def write_landmarks(path: Path | str, landmarks: Mapping[str, FloatArray]) -> No
 
 
 def read_landmark_indices(path: Path | str) -> dict[str, int]:
-    """Read landmarks given as vertex numbers, from CSV with the header `name,vertex`; `#` for comments.
+    """Read landmarks given as vertex numbers, from CSV with the header `name,vertex`; `#` begins a comment.
 
     Args:
         path: the file; vertices count from 0.
@@ -126,7 +128,7 @@ def read_landmark_indices(path: Path | str) -> dict[str, int]:
 
     Raises:
         FileError: it does not exist or cannot be read.
-        FileFormatError: another header, a name twice, or a vertex that is not a whole number from 0.
+        FileFormatError: another header, a name twice, or a vertex that is not a non-negative integer.
     """
     path = Path(path)
     rows = csv_rows(_content(path), path)
@@ -135,7 +137,7 @@ def read_landmark_indices(path: Path | str) -> dict[str, int]:
     indices: dict[str, int] = {}
     for row in rows[1:]:
         if len(row) < 2 or not row[1].isascii() or not row[1].isdecimal() or len(row[1]) > 18:
-            raise damage_error(path, f"landmark '{row[0][:60]}' has no vertex number (a whole number from 0)")
+            raise damage_error(path, f"landmark '{row[0][:60]}' has no vertex number (an integer from 0)")
         if not row[0] or row[0] in indices:
             raise damage_error(path, f"it has the name '{row[0][:60]}' twice or empty, so rename it")
         indices[row[0]] = int(row[1])
@@ -143,11 +145,11 @@ def read_landmark_indices(path: Path | str) -> dict[str, int]:
 
 
 def read_region(path: Path | str) -> tuple[int, ...]:
-    """Read vertices, counted from 0: a CSV table with a column `vertex`, or one number in each line; `#` for comments.
+    """Read vertices, counted from 0: a CSV table with a column `vertex`, or one number per line; `#` begins a comment.
 
     Raises:
         FileError: it does not exist or cannot be read.
-        FileFormatError: it holds something else, or nothing.
+        FileFormatError: it contains other data, or nothing.
     """
     path = Path(path)
     remedy = "give one vertex number in each line, or a column named vertex"
@@ -155,14 +157,16 @@ def read_region(path: Path | str) -> tuple[int, ...]:
     try:
         rows = csv_rows(data, path)
     except FileFormatError as error:
-        raise FileFormatError(f"{path} is no list of vertices; {remedy}.") from error
+        raise FileFormatError(f"{path} is not a list of vertices; {remedy}.") from error
     header = [cell.lower() for cell in rows[0]] if rows else []
     column = header.index(_VERTEX) if _VERTEX in header else 0
     cells = [row[column] if column < len(row) else "" for row in (rows[1:] if _VERTEX in header else rows)]
     wrong = next((cell for cell in cells if not (cell.isascii() and cell.isdecimal() and len(cell) < _DIGITS)), None)
     if wrong is not None or not cells:
-        problem = "it is empty" if not cells else f"{wrong[:40]!r} is no vertex number" if wrong else "a row has none"
-        raise FileFormatError(f"{path} is no list of vertices ({problem}); {remedy}.")
+        problem = (
+            "it is empty" if not cells else f"{wrong[:40]!r} is not a vertex number" if wrong else "a row has none"
+        )
+        raise FileFormatError(f"{path} is not a list of vertices ({problem}); {remedy}.")
     return tuple(int(cell) for cell in cells)
 
 
@@ -171,7 +175,7 @@ _DISTANCE_COLUMN = "distance_mm"
 
 
 def is_of_vertices(path: Path | str) -> bool:
-    """Return whether a CSV file has the header of landmarks on vertices, `name,vertex`, and not one of points.
+    """Return whether a CSV file has the header `name,vertex` of landmarks at vertices.
 
     Raises:
         FileError: it does not exist or cannot be read.
@@ -186,16 +190,16 @@ def _has_vertex_header(rows: list[list[str]]) -> bool:
 
 
 def read_surface_landmarks(path: Path | str) -> SurfaceLandmarks:
-    """Read landmarks on surfaces in correspondence, from CSV; `#` for comments.
+    """Read landmarks on surfaces in correspondence, from CSV; `#` begins a comment.
 
-    The header is `name,vertex`, for landmarks at vertices, or that of `write_surface_landmarks`.
+    The header is `name,vertex` for landmarks at vertices, or else that of `write_surface_landmarks`.
 
     Args:
         path: the file; vertices count from 0.
 
     Raises:
         FileError: it does not exist or cannot be read.
-        FileFormatError: another header, a name twice, a vertex that is not a whole number from 0, or coordinates that
+        FileFormatError: another header, a name twice, a vertex that is not a non-negative integer, or coordinates that
             are not barycentric.
     """
     path = Path(path)
@@ -221,19 +225,19 @@ def read_surface_landmarks(path: Path | str) -> SurfaceLandmarks:
 
 def _index(cell: str) -> int:
     if not cell.isascii() or not cell.isdecimal():
-        raise ValueError("not a whole number")
+        raise ValueError("not an integer")
     return int(cell)
 
 
 def write_surface_landmarks(path: Path | str, landmarks: SurfaceLandmarks) -> None:
-    """Write landmarks on surfaces in correspondence as CSV, exactly, whole or not at all.
+    """Write landmarks on surfaces in correspondence exactly, as CSV, atomically.
 
-    Each row has the vertices of a triangle and their weights, which are barycentric coordinates, the largest first, and
-    how far the given point lay from the surface. Landmarks that are all at vertices are written as `name,vertex`.
+    Each row contains the vertices of a triangle, their weights (barycentric coordinates, the largest first), and the
+    distance of the given point from the surface. If all landmarks are at vertices, the columns are `name,vertex`.
 
     Args:
         path: the file.
-        landmarks: on the surfaces; vertices count from 0.
+        landmarks: landmarks on the surfaces; vertices count from 0.
 
     Raises:
         FileError: the folder cannot be written, or the disk is full.
@@ -258,7 +262,7 @@ def surface_landmark_cells(landmarks: SurfaceLandmarks) -> tuple[list[str], list
 
 
 def write_landmark_indices(path: Path | str, indices: Mapping[str, int]) -> None:
-    """Write landmarks given as vertex numbers, as CSV with the header `name,vertex`, whole or not at all.
+    """Write landmarks given as vertex numbers, as CSV with the header `name,vertex`, atomically.
 
     Args:
         path: the file.
@@ -271,7 +275,7 @@ def write_landmark_indices(path: Path | str, indices: Mapping[str, int]) -> None
 
 
 def _format(path: Path, verb: str) -> LandmarkFormat:
-    # The longest ending first, so that .mrk.json is not taken for .json.
+    # The longest ending first, so that .mrk.json is not read as .json.
     for ending in sorted(LANDMARK_FORMATS, key=len, reverse=True):
         if path.name.lower().endswith(ending):
             return LANDMARK_FORMATS[ending]
@@ -300,8 +304,8 @@ def _point(values: Iterable[Any], landmark_name: str, path: Path) -> FloatArray:
     return np.array(numbers, dtype=np.float64)
 
 
-def _from_json(parse: Callable[[Any, Path], Pairs]) -> Callable[[bytes, Path], Pairs]:
-    """Wrap a reader of parsed JSON so that missing or wrong values raise one clear error."""
+def _json_reader(parse: Callable[[Any, Path], Pairs]) -> Callable[[bytes, Path], Pairs]:
+    """Return a reader of JSON in which missing or wrong values raise a `FileFormatError`."""
 
     def wrapped(data: bytes, path: Path) -> Pairs:
         value = json_value(data, path)
@@ -340,7 +344,7 @@ def _ljson_group(group: Any, prefix: str, path: Path) -> Pairs:
         mask, label = entry["mask"], _label(entry["label"], path)
         for position, index in enumerate(mask):
             if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index < len(points):
-                raise damage_error(path, f"label '{label[:60]}' names a point that is not there")
+                raise damage_error(path, f"label '{label[:60]}' names a point that does not exist")
             name = label if len(mask) == 1 else f"{label}_{position}"
             names.setdefault(index, prefix + name)
     ordered = [*names, *(i for i in range(len(points)) if i not in names)]
@@ -372,7 +376,7 @@ def _write_ljson(landmarks: Mapping[str, FloatArray]) -> str:
 def _slicer(value: Any, path: Path) -> Pairs:
     for markup in value["markups"]:
         sign = _sign_of_frame(str(markup.get("coordinateSystem", "LPS")), path)
-        # One unit, or a list of that of each axis.
+        # A unit, or a list of units of the axes.
         unit = next(iter(re.findall(r"\w+", str(markup.get("coordinateUnits") or "mm").lower())), "mm")
         if unit not in MM_OF_UNITS:
             raise damage_error(path, f"its coordinate units are {unit[:20]!r}, so save it in mm")
@@ -384,7 +388,7 @@ def _slicer(value: Any, path: Path) -> Pairs:
 
 
 def _sign_of_frame(system: str, path: Path) -> FloatArray:
-    """Return the signs (3,) that take coordinates of 3D Slicer to LPS; 0 is RAS and 1 LPS in files of old versions."""
+    """Return the signs (3,) that convert coordinates of 3D Slicer to LPS; old files use 0 for RAS and 1 for LPS."""
     letters = "".join(word[:1] for word in system.strip().upper().split("-"))
     frame = {"0": "RAS", "1": "LPS"}.get(letters, letters if "-" in system else system.strip().upper())
     if frame not in ("LPS", "RAS"):
@@ -487,7 +491,7 @@ def _read_csv(data: bytes, path: Path) -> Pairs:
     if rows and not all(is_number(cell) for cell in rows[0][1:4]):
         header = [cell.lower() for cell in rows[0]]
         if header[:2] == ["name", "vertex"]:
-            raise damage_error(path, "it holds vertex numbers, not coordinates ('name,x,y,z')")
+            raise damage_error(path, "it contains vertex numbers, not coordinates ('name,x,y,z')")
         if not {"x", "y", "z"} <= set(header[1:]):
             raise damage_error(path, "its first line is neither 'name,x,y,z' nor a landmark")
         columns = [header.index(axis, 1) for axis in "xyz"]
@@ -532,10 +536,12 @@ def _read_lm3(data: bytes, path: Path) -> Pairs:
     header_matches = (re.fullmatch(r"(\d{1,6})(?:\s+landmarks?\s*:?)?", line, re.IGNORECASE) for line in lines)
     header_row, count = next(((i, int(m[1])) for i, m in enumerate(header_matches) if m), (0, -1))
     if count < 0:
-        raise damage_error(path, "it does not say how many landmarks it holds, so it is not an .lm3 file")
+        raise damage_error(path, "it does not state the number of landmarks, so it is not an .lm3 file")
     body = lines[header_row + 1 :]
     if len(body) != 2 * count:
-        raise damage_error(path, f"it says {count} landmarks, but {len(body)} lines follow; it is damaged or cut short")
+        raise damage_error(
+            path, f"it declares {count} landmarks, but {len(body)} lines follow; it is damaged or cut short"
+        )
     return [
         (n, _point(xyz.split(), f"landmark '{n[:60]}'", path)) for n, xyz in zip(body[::2], body[1::2], strict=True)
     ]
@@ -593,7 +599,7 @@ def _read_amira(data: bytes, path: Path) -> Pairs:
     count = re.search(r"^define\s+Markers\s+(\d{1,9})\s*$", text, re.MULTILINE)
     block = re.search(r"^Markers\s*\{\s*(?:float|double)\[3\]\s+Coordinates\s*\}\s*=?\s*@(\d+)", text, re.MULTILINE)
     if not text.startswith("#") or " ASCII " not in text.partition("\n")[0] or not (count and block):
-        raise damage_error(path, "it is no ASCII landmark file of Amira with Markers, so save it as landmarkAscii")
+        raise damage_error(path, "it is not an ASCII landmark file of Amira with Markers, so save it as landmarkAscii")
     if sets := re.search(r"NumSets\s+(?!1\b)(\d+)", text):
         raise damage_error(path, f"it has {sets[1][:9]} sets of landmarks, so save each in a file of its own")
     body = re.search(rf"^@{block[1]}\s*\n([^@]*)", text, re.MULTILINE)
@@ -615,7 +621,7 @@ _POINTS_HEAD = re.compile(r"version\b.*|n_points\s*:\s*(\d{1,6})|(?:s\s+)?(\d{1,
 
 
 def _read_points(data: bytes, path: Path) -> Pairs:
-    """Read rows `x y z` or `name x y z`, after a count or a header perhaps, as landmark editors save them."""
+    """Read rows `x y z` or `name x y z`, optionally after a count or a header, as landmark editors save them."""
     count, declared = 0, None
     for line in _number_lines(data, path):
         row = line.partition("#")[0].strip()
@@ -632,15 +638,17 @@ def _read_points(data: bytes, path: Path) -> Pairs:
         yield name, _point(words[-3:], f"landmark '{name[:60]}'", path)
         count += 1
     if declared is not None and declared != count:
-        raise damage_error(path, f"it says {declared} landmarks, but {count} rows follow; it is damaged or cut short")
+        raise damage_error(
+            path, f"it declares {declared} landmarks, but {count} rows follow; it is damaged or cut short"
+        )
 
 
 LANDMARK_FORMATS: Mapping[str, LandmarkFormat] = MappingProxyType(
     {
-        ".ljson": LandmarkFormat("menpo LJSON", _from_json(_ljson), _write_ljson),
+        ".ljson": LandmarkFormat("menpo LJSON", _json_reader(_ljson), _write_ljson),
         ".pp": LandmarkFormat("MeshLab picked points", _read_pp, _write_pp),
-        ".mrk.json": LandmarkFormat("3D Slicer markups", _from_json(_slicer), markups_text),
-        ".json": LandmarkFormat("scalismo", _from_json(_any_json), _write_scalismo),
+        ".mrk.json": LandmarkFormat("3D Slicer markups", _json_reader(_slicer), markups_text),
+        ".json": LandmarkFormat("scalismo", _json_reader(_any_json), _write_scalismo),
         ".csv": LandmarkFormat("CSV", _read_csv, _write_csv),
         ".fcsv": LandmarkFormat("3D Slicer fiducials", _read_fcsv, fcsv_text),
     }
@@ -661,16 +669,16 @@ READ_ONLY_LANDMARKS: Mapping[str, Callable[[bytes, Path], Pairs]] = MappingProxy
 """File name ending -> reader (content, path) -> names and points, for formats that are not written."""
 
 FIDUCIAL_ENDINGS = (".landmarks.csv", ".landmarks.mrk.json", ".landmarks.fcsv")
-"""Of the files that hold the landmarks of a fit, after NAME."""
+"""Endings, after NAME, of the files with the landmarks of a fit."""
 
 Found = Mapping[str, Mapping[str, Any]]
-"""Name -> `at` (x, y, z) in the scan's frame and unit, and `stddev_mm` along its axes, None where it is not known."""
+"""Name -> `at` (x, y, z) in the frame and unit of the scan, and `stddev_mm` along its axes, None if unknown."""
 
 
 def fiducial_texts(fiducials: Found) -> dict[str, str]:
     """Return ending -> text of each file: a table, and 3D Slicer's two formats, all in the scan's frame and unit.
 
-    Slicer takes the coordinates of a mesh as they are, for LPS and mm, so it shows the points on the scan.
+    Slicer interprets the coordinates of a mesh as LPS and mm, so it shows the points on the scan.
     """
     points = {name: np.array(fiducial["at"], dtype=np.float64) for name, fiducial in fiducials.items()}
     descriptions = {name: _describe(fiducial["stddev_mm"]) for name, fiducial in fiducials.items()}

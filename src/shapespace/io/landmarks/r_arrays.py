@@ -26,9 +26,9 @@ R_ENDINGS = (".rda", ".rdata", ".rds")
 """Endings, in lower case, of files of R objects."""
 _CURVES = ("curvepts", "curves", "curveslide", "curvslide")
 _SURFACES = ("surfslide", "surfaces", "surfpts")
-"""Parts of geomorph's data sets with the numbers of semilandmarks."""
+"""Names of parts of geomorph's data sets with the numbers of semilandmarks."""
 _LISTED = 8  # arrays in a sentence
-_DEEPEST = 2  # lists in lists that arrays are looked for in
+_DEEPEST = 2  # levels of nested lists that are searched for arrays
 
 
 def parse_r(data: bytes, path: Path, name: str | None = None) -> LandmarkConfigurations:
@@ -41,13 +41,13 @@ def parse_r(data: bytes, path: Path, name: str | None = None) -> LandmarkConfigu
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            content = rdata.parser.parse_data(_unpacked(data), altrep_constructor_dict=_expansions(rdata))
+            content = rdata.parser.parse_data(_decompress(data), altrep_constructor_dict=_expansions(rdata))
             found = dict(_arrays(_objects(content.object, rdata), ""))
-    # The parser raises many kinds of errors on damaged files.
+    # The parser raises many types of errors on damaged files.
     except Exception as error:
         reason = " ".join(str(error).split())[:60] or type(error).__name__
-        raise damage_error(path, f"it is no R data file, or is damaged ({reason})") from error
-    chosen = {key: one for key, one in found.items() if name is None or name in (key, key.rpartition("$")[2])}
+        raise damage_error(path, f"it is not an R data file, or is damaged ({reason})") from error
+    chosen = {key: array for key, array in found.items() if name is None or name in (key, key.rpartition("$")[2])}
     listed = first_names([key or "(unnamed)" for key in found], _LISTED)
     if not found:
         raise damage_error(path, "it has no array of landmarks x 2 or 3 dimensions x specimens")
@@ -58,14 +58,14 @@ def parse_r(data: bytes, path: Path, name: str | None = None) -> LandmarkConfigu
     notes = [f"The landmarks are those of {key}."] if key else []
     names = names or tuple(f"specimen {k}" for k in range(1, len(points) + 1))
     labels = labels or tuple(map(str, range(1, points.shape[1] + 1)))
-    columns = {part: cells for part, one in others.items() if len(cells := _cells(one)) == len(points)}
+    columns = {part: cells for part, values in others.items() if len(cells := _cells(values)) == len(points)}
     sliders = {3: np.zeros((0, 3), dtype=np.int32), 1: np.zeros((0, 1), dtype=np.int32)}
-    for part, one in others.items():
+    for part, values in others.items():
         width = 3 if part.lower() in _CURVES else 1
-        if part.lower() in (*_CURVES, *_SURFACES) and getattr(one, "size", 0) and one.size % width == 0:
-            numbers = np.asarray(one, dtype=np.float64).reshape(-1, width)
+        if part.lower() in (*_CURVES, *_SURFACES) and getattr(values, "size", 0) and values.size % width == 0:
+            numbers = np.asarray(values, dtype=np.float64).reshape(-1, width)
             if not np.isin(numbers, np.arange(1, len(labels) + 1)).all():
-                raise damage_error(path, f"{part} has numbers that are no landmarks, which go from 1 to {len(labels)}")
+                raise damage_error(path, f"{part} has numbers that are not landmarks, from 1 to {len(labels)}")
             sliders[width] = numbers.astype(np.int32) - 1
             columns.pop(part, None)
             notes.append(f"The sliders are those of {part}.")
@@ -75,8 +75,8 @@ def parse_r(data: bytes, path: Path, name: str | None = None) -> LandmarkConfigu
     ))  # fmt: skip
 
 
-def _unpacked(data: bytes) -> bytes:
-    """Return data without compression, up to the limit of a file, so that a small one cannot fill the memory."""
+def _decompress(data: bytes) -> bytes:
+    """Return uncompressed data up to the limit of a file, so that a small file cannot fill the memory."""
     limit = LARGEST_CONFIGURATIONS_FILE_BYTES
     for start, module in ((b"\x1f\x8b", gzip), (b"BZh", bz2), (b"\xfd7zXZ", lzma)):
         if data.startswith(start):
@@ -89,7 +89,7 @@ def _unpacked(data: bytes) -> bytes:
 
 
 def _expansions(rdata: Any) -> dict[bytes, Any]:
-    """Return what expands compact vectors of R, which refuses sequences longer than any file's."""
+    """Return the constructors of compact vectors of R, with a limit on the length of sequences."""
 
     def bounded(expand: Any, state: Any) -> Any:
         if not 0 <= state.value[0] <= LARGEST_CONFIGURATIONS_FILE_BYTES // 8:
@@ -101,11 +101,11 @@ def _expansions(rdata: Any) -> dict[bytes, Any]:
 
 
 def _objects(content: Any, rdata: Any) -> dict[str, Any]:
-    """Return the objects of a file by name, without functions and others that cannot be converted."""
+    """Return the objects of a file by name, without functions and other objects that cannot be converted."""
     objects: dict[str, Any] = {}
     while content.info.type.name == "LIST":
         tag = content.tag.referenced_object or content.tag
-        # Functions and environments are no data.
+        # Functions and environments are not data.
         with contextlib.suppress(AssertionError, NotImplementedError):
             objects[tag.value.value.decode()] = rdata.conversion.convert(content.value[0])
         content = content.value[1]
@@ -115,24 +115,24 @@ def _objects(content: Any, rdata: Any) -> dict[str, Any]:
 def _arrays(
     objects: Mapping[str, Any], prefix: str, depth: int = 0
 ) -> Iterator[tuple[str, tuple[FloatArray, tuple[str, ...], tuple[str, ...], Mapping[str, Any]]]]:
-    """Yield name -> points (n, p, k), names of landmarks and specimens, and the objects next to it, of each array."""
-    objects = {str(name): one for name, one in objects.items()}
-    for name, one in objects.items():
-        shape = getattr(one, "shape", ())
-        if len(shape) == 3 and shape[1] in (2, 3) and 0 not in shape and np.asarray(one).dtype.kind in "fi":
-            coords = getattr(one, "coords", {})
+    """Yield the name of each array, its points (n, p, k), names of landmarks and specimens, and adjacent objects."""
+    objects = {str(name): value for name, value in objects.items()}
+    for name, value in objects.items():
+        shape = getattr(value, "shape", ())
+        if len(shape) == 3 and shape[1] in (2, 3) and 0 not in shape and np.asarray(value).dtype.kind in "fi":
+            coords = getattr(value, "coords", {})
             labels, names = (
                 tuple(map(str, coords[axis].values)) if axis in coords else () for axis in ("dim_0", "dim_2")
             )
-            points = np.moveaxis(np.ma.filled(np.ma.asarray(one).astype(np.float64), np.nan), 2, 0)
+            points = np.moveaxis(np.ma.filled(np.ma.asarray(value).astype(np.float64), np.nan), 2, 0)
             yield f"{prefix}{name}", (points, labels, names, objects)
-        elif isinstance(one, Mapping) and depth < _DEEPEST:
-            yield from _arrays(cast(Mapping[str, Any], one), f"{prefix}{name}$" if name else prefix, depth + 1)
+        elif isinstance(value, Mapping) and depth < _DEEPEST:
+            yield from _arrays(cast(Mapping[str, Any], value), f"{prefix}{name}$" if name else prefix, depth + 1)
 
 
-def _cells(one: Any) -> tuple[str, ...]:
-    """Return the values of a factor or a vector as text; missing ones are empty."""
-    if len(getattr(one, "shape", ())) != 1:
+def _cells(vector: Any) -> tuple[str, ...]:
+    """Return the values of a factor or a vector as text; missing values are empty."""
+    if len(getattr(vector, "shape", ())) != 1:
         return ()
-    values: list[Any] = np.ma.filled(np.ma.asarray(one).astype(object), None).tolist()
+    values: list[Any] = np.ma.filled(np.ma.asarray(vector).astype(object), None).tolist()
     return tuple("" if value is None or value != value else str(value) for value in values)

@@ -24,21 +24,21 @@ from shapespace.io.tables.table_io import MISSING
 from shapespace.reprs import first_names
 from shapespace.types import FloatArray
 
-_LEFT_OUT = "="
-"""Key of values, which no file has, of specimens with an outline of fewer points than enclose an area."""
+_OMITTED_OUTLINE = "="
+"""Internal key of the values of specimens with an outline of too few points to enclose an area."""
 LEAST_OUTLINE = 3  # points that enclose an area
 Rows: TypeAlias = list[list[float]]
 _NTS_HEADER = re.compile(
     r"1\s+(\d{1,9})\s*([LBE]?)\s+(\d{1,9})\s*(L?)\s+([01])(?:\s+([^\sD]\S*))?(?:\s+DIM\s*=\s*([23]))?\s*", re.IGNORECASE
 )
 _NTS_MISSING = -999.0
-"""Written for missing coordinates, ten times as much where a coordinate is the same."""
+"""Code of missing coordinates; multiplied by ten if a coordinate has this value."""
 
 
 def coordinates(
     cells: Iterable[str], path: Path, describe: Callable[[int], str], noun: str = "coordinate"
 ) -> list[float]:
-    """Return the numbers in cells, not-a-number for missing ones; `describe` names the owner of a cell in messages."""
+    """Return the numbers in cells, NaN for missing values; `describe` returns the owner of a cell for messages."""
     numbers: list[float] = []
     for at, cell in enumerate(cells):
         try:
@@ -62,14 +62,15 @@ def parse_tps(text: str, path: Path, curve_points: int | None = None) -> Landmar
     have it, as in geomorph. IMAGE=, COMMENT= and other keys become columns.
     """
     specimens, curves, values = zip(*tps_specimens(text, path), strict=True)
-    images = _names_of_files([one.get("image", "") for one in values], r"\.\w{1,5}$")
+    images = _names_of_files([fields.get("image", "") for fields in values], r"\.\w{1,5}$")
     names = tuple(
-        one.get("id") or image or f"specimen {k}" for k, (one, image) in enumerate(zip(values, images, strict=True), 1)
+        fields.get("id") or image or f"specimen {k}"
+        for k, (fields, image) in enumerate(zip(values, images, strict=True), 1)
     )
     notes = list[str]()
     if len(set(names)) < len(names) == len(set(images)) and all(images):
         names = tuple(images)
-        notes.append("Specimens are called as their IMAGE=, since values of ID= are repeated.")
+        notes.append("Specimens are named after their IMAGE=, since values of ID= are repeated.")
     closed = [is_closed for _, is_closed in curves[0]]
     for name, rows, own in zip(names, specimens, curves, strict=True):
         if len(rows) != len(specimens[0]) or [is_closed for _, is_closed in own] != closed:
@@ -87,10 +88,10 @@ def parse_tps(text: str, path: Path, curve_points: int | None = None) -> Landmar
     resampled, changes = equal_curves([own[1:] for own in split], closed, names, path, curve_points)
     points = np.stack([np.concatenate([own[0], *others]) for own, others in zip(split, resampled, strict=True)])
     notes += changes
-    unscaled = [name for name, one in zip(names, values, strict=True) if "scale" not in one]
+    unscaled = [name for name, fields in zip(names, values, strict=True) if "scale" not in fields]
     scales = np.ones(len(names))
     if not unscaled:
-        cells = [one["scale"].replace(",", ".") for one in values]  # a decimal comma, as in coordinates
+        cells = [fields["scale"].replace(",", ".") for fields in values]  # a decimal comma, as in coordinates
         scales = np.array(coordinates(cells, path, lambda k: f"specimen {names[k]!r}", "SCALE="))
         if not (scales > 0).all():
             raise damage_error(path, "a SCALE= is not above 0, so correct it")
@@ -102,11 +103,11 @@ def parse_tps(text: str, path: Path, curve_points: int | None = None) -> Landmar
         )
     elif points.shape[2] == 2:
         notes.append("No specimen has SCALE=, so sizes are in the unit of the file, such as pixels.")
-    if any(_LEFT_OUT in one for one in values):
-        notes.append("Outlines (OUTLINES=) of fewer than 3 points are left out.")
-    keys = dict.fromkeys(key for one in values for key in one if key not in ("id", "scale", _LEFT_OUT))
+    if any(_OMITTED_OUTLINE in fields for fields in values):
+        notes.append("Outlines (OUTLINES=) of fewer than 3 points are omitted.")
+    keys = dict.fromkeys(key for fields in values for key in fields if key not in ("id", "scale", _OMITTED_OUTLINE))
     raw = mark_missing(LandmarkConfigurations(
-        names=names, points=points, columns={key: tuple(one.get(key, "") for one in values) for key in keys},
+        names=names, points=points, columns={key: tuple(fields.get(key, "") for fields in values) for key in keys},
         curves=consecutive_curves(len(specimens[0]), resampled[0], closed),
         where=str(path), notes=tuple(notes),
     ))  # fmt: skip
@@ -114,12 +115,12 @@ def parse_tps(text: str, path: Path, curve_points: int | None = None) -> Landmar
 
 
 def tps_specimens(text: str, path: Path) -> Iterator[tuple[Rows, list[tuple[Rows, bool]], dict[str, str]]]:
-    """Yield the coordinates of the landmarks of a specimen, its curves with whether they are closed, and other keys."""
+    """Yield the landmark coordinates of each specimen, its curves and whether they are closed, and other keys."""
     text = numeric_text(text.encode("utf-8", "replace"), path, commas_separate=True).decode()
     lines = "\n".join(line.strip() for line in text.splitlines() if line.strip())
     start, *blocks = re.split(r"^(?=LM3?\s*=)", lines, flags=re.IGNORECASE | re.MULTILINE)
     if start or not blocks:
-        raise damage_error(path, "it is no TPS file, since it does not begin with LM= or LM3=")
+        raise damage_error(path, "it is not a TPS file, since it does not begin with LM= or LM3=")
     for number, block in enumerate(blocks, 1):
         yield _specimen(block, number, path)
 
@@ -149,7 +150,7 @@ def _specimen(block: str, number: int, path: Path) -> tuple[Rows, list[tuple[Row
             )
             if is_outline and count < LEAST_OUTLINE:
                 del parts[-1]
-                values[_LEFT_OUT] = ""
+                values[_OMITTED_OUTLINE] = ""
         elif key in ("curves", "outlines"):
             is_outline = key == "outlines"
         else:
@@ -158,14 +159,14 @@ def _specimen(block: str, number: int, path: Path) -> tuple[Rows, list[tuple[Row
 
 
 def _names_of_files(files: Sequence[str], ending: str) -> list[str]:
-    """Return the names of files without an ending, and without their folders if they differ otherwise."""
+    """Return the names of files without an ending, and without their folders if the names alone are distinct."""
     names = [re.sub(ending, "", file, flags=re.IGNORECASE) for file in files]
     bases = [re.split(r"[/\\]", name)[-1] for name in names]
     return bases if len(set(bases)) == len(set(names)) else names
 
 
 def _arrays(specimens: Sequence[Rows], names: Sequence[str], path: Path) -> list[FloatArray]:
-    """Return the (L, D) coordinates of each specimen; a row of not-a-number alone may have any width."""
+    """Return the (L, D) coordinates of each specimen; a row that is all not-a-number may have any width."""
     rows = [(name, row) for name, points in zip(names, specimens, strict=True) for row in points]
     widths = {len(row): name for name, row in reversed(rows) if not all(map(math.isnan, row))}
     if set(widths) not in ({2}, {3}):
@@ -183,8 +184,8 @@ def tps_text(specimens: Mapping[str, FloatArray], values: Mapping[str, Sequence[
     """Return a TPS file of several specimens, as geomorph reads it, with missing landmarks as NA.
 
     Args:
-        specimens: name -> (L, 2) or (L, 3).
-        values: key, such as `IMAGE` -> value of each specimen; empty ones are left out.
+        specimens: name -> landmarks (L, 2) or (L, 3).
+        values: key, such as `IMAGE` -> value of each specimen; empty values are not written.
     """
     lines: list[str] = []
     for at, (name, points) in enumerate(specimens.items()):
@@ -220,7 +221,7 @@ def parse_nts(text: str, path: Path) -> LandmarkConfigurations:
     if header[5] == "1" and header[6]:
         [code] = coordinates([header[6]], path, lambda _: "the header")
         points[points == code] = math.nan
-        notes.append(f"Coordinates {code:g} are missing, as the header says.")
+        notes.append(f"Coordinates {code:g} are missing, as the header declares.")
     if p == width and n > 1:
         names = [path.name.removesuffix(path.suffix)]
     points = points.reshape(len(names), -1, width)
@@ -228,7 +229,7 @@ def parse_nts(text: str, path: Path) -> LandmarkConfigurations:
 
 
 def parse_dta(text: str, path: Path) -> LandmarkConfigurations:
-    """Return the landmarks of a file of IDAV Landmark, which is NTS with the names of meshes."""
+    """Return the landmarks of a file of IDAV Landmark, which is NTS with names of meshes."""
     raw = parse_nts(text, path)
     return replace(raw, names=tuple(_names_of_files(raw.names, r"\.(ply|obj|stl|off|vtk|vtp)(\.gz)?$")))
 
@@ -276,7 +277,7 @@ def nts_text(raw: LandmarkConfigurations) -> str:
     """Return an NTS file with a labelled row for each specimen; names with white space raise InputError."""
     bad = next((name for name in raw.names if not name or len(name.split()) != 1 or name[0] in "\"'"), None)
     if bad is not None:
-        raise InputError(f"NTS cannot hold the specimen name {bad[:60]!r}; rename it without spaces or write TPS.")
+        raise InputError(f"NTS cannot store the specimen name {bad[:60]!r}; rename it without spaces or write TPS.")
     n, count, width = raw.points.shape
     missing = _NTS_MISSING
     while (raw.points == missing).any():

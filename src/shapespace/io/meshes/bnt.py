@@ -2,8 +2,8 @@
 
 Layout, as in the database's own reader (A. Savran, `read_bntfile`, 2008), little-endian and without padding: uint16
 rows, uint16 columns, float64 zmin, uint16 length of the image's name, the name, uint32 count (5 · rows · columns), then
-five runs of rows · columns float64: x, y, z in mm, and two image coordinates from 0 to 1. Where z is zmin there is no
-point.
+five runs of rows · columns float64: x, y, z in mm, and two image coordinates from 0 to 1. Points with z = zmin are
+missing.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from shapespace.types import FloatArray, Mesh
 _HEADER = struct.Struct("<HHdH")
 _COUNT = struct.Struct("<I")
 _COLUMNS = 5  # x, y, z and two image coordinates
-# Of a surface seen at an angle the steps grow by 1 / cos: 8 keeps what is turned up to 82 degrees from the camera.
+# On a surface inclined to the camera the steps grow by 1 / cos: a factor of 8 keeps surfaces inclined up to 82 degrees.
 _LONGEST_STEPS = 8.0
 
 
 def read_bnt(data: bytes, path: Path) -> Mesh:
-    """Read a Bosphorus scan: its points row by row, missing ones left out, and triangles between neighbours.
+    """Read a Bosphorus scan: its points row by row without missing ones, and triangles between neighbours.
 
-    Each cell of the grid gives two triangles where its four corners are there, one where three are. A triangle with an
-    edge longer than 8 times the median step between neighbours spans a jump in depth and is left out. The faces are
-    turned so that the surface looks along +z, towards the camera.
+    A cell of the grid becomes two triangles if its four corners are present, and one if three are present. A triangle
+    with an edge longer than 8 times the median step between neighbours spans a jump in depth and is omitted. The faces
+    are oriented along +z, towards the camera.
 
     Args:
-        data: the whole file.
-        path: its name, for messages and the mesh's name.
+        data: complete content of the file.
+        path: path of the file, used in messages and as the name of the mesh.
 
     Raises:
-        FileFormatError: the header contradicts itself or the length of the file, or no point is there.
+        FileFormatError: the header is inconsistent or does not match the length of the file, or all points are missing.
     """
     if len(data) < _HEADER.size:
         raise damage_error(path, f"it is too short to be a Bosphorus file; {CUT_SHORT}")
@@ -50,14 +50,14 @@ def read_bnt(data: bytes, path: Path) -> Mesh:
     if not points or count != _COLUMNS * points:
         raise damage_error(
             path,
-            f"its header declares {rows} rows, {columns} columns and {count} numbers, which is no Bosphorus file "
-            "(5 numbers a point)",
+            f"its header declares {rows} rows, {columns} columns and {count} numbers, so it is not a Bosphorus file "
+            "(5 numbers per point)",
         )
     check_count(count, 8, len(data) - data_start, "numbers", path)
     if not math.isfinite(zmin):
         raise damage_error(path, "its depth of missing points is not finite, so it is damaged")
     grid = np.frombuffer(data, dtype="<f8", count=3 * points, offset=data_start).reshape(3, points).T.astype(np.float64)
-    # zmin is the least depth there is.
+    # zmin is the smallest depth in the file.
     is_measured = ~(grid[:, 2] <= zmin)
     if not is_measured.any():
         raise damage_error(path, "all its points are missing")
@@ -69,11 +69,11 @@ def read_bnt(data: bytes, path: Path) -> Mesh:
 
 
 def grid_triangles(number: IndexArray, vertices: FloatArray) -> IndexArray:
-    """Return the triangles (F, 3) between neighbours in a grid, turned to look along +z.
+    """Return the triangles (F, 3) between neighbours in a grid, oriented along +z.
 
     Args:
-        number: (R, C) which vertex stands where, -1 for none.
-        vertices: (V, 3) float64, in any unit.
+        number: (R, C) index of the vertex at each grid position, -1 for none.
+        vertices: (V, 3) float64 positions, in any unit.
     """
     a, b = number[:-1, :-1].ravel(), number[:-1, 1:].ravel()
     c, d = number[1:, :-1].ravel(), number[1:, 1:].ravel()
@@ -93,7 +93,7 @@ def grid_triangles(number: IndexArray, vertices: FloatArray) -> IndexArray:
         return faces[:0]
     positions = vertices[faces]
     edges = np.linalg.norm(positions - np.roll(positions, 1, axis=1), axis=2)
-    # A comparison with NaN is false, so that triangles at points that are no numbers go too.
+    # A comparison with NaN is false, so triangles with NaN corners are removed too.
     keep = (edges <= _LONGEST_STEPS * np.median(steps)).all(axis=1)
     faces, positions = faces[keep], positions[keep]
     along, across = positions[:, 1] - positions[:, 0], positions[:, 2] - positions[:, 0]

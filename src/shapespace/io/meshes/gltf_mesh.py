@@ -1,6 +1,6 @@
 """glTF 2.0 reader and writer, as `.gltf` with its buffers and as one `.glb` file; see the Khronos specification.
 
-trimesh reads glTF too, but it decodes textures, merges by material and reports damage by internal errors.
+trimesh reads glTF too, but it decodes textures, merges by material and raises internal errors for damaged files.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _POINTS, _TRIANGLES, _STRIP, _FAN = 0, 4, 5, 6
 _VERTICES, _CORNERS = 34962, 34963  # glTF 2.0 bufferView.target: ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER
 _COMPRESSIONS = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
-# What a file may require without its points and triangles becoming others.
+# Extensions that a file may require and that do not affect its points and triangles.
 _HARMLESS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "KHR_lights_", "EXT_lights_", "KHR_xmp")
 _HARMLESS_TOO = ("KHR_mesh_quantization", "KHR_animation_pointer")
-# Far from the origin float32 is too coarse, so the centre goes into the node, which holds doubles.
+# Far from the origin float32 is too coarse, so the node stores the centre, in double precision.
 _FAR = 16.0
 
 Values = npt.NDArray[Any]
@@ -54,14 +54,14 @@ class Morphs:
     """A mesh with morph targets.
 
     Args:
-        vertices: (V, 3) where all weights are zero, in the frame of the scene.
-        faces: (F, 3), or None for points.
-        targets: (K, V, 3) what a weight of one adds to the vertices.
-        names: (K,) of the targets, or none.
-        weights: (K,) with which the file shows it.
-        extras: what the mesh says beside.
-        copyright: what the file says of it.
-        n_others: how many more meshes there are in the scene.
+        vertices: (V, 3) positions for weights of zero, in the frame of the scene.
+        faces: (F, 3) triangles, or None for a point cloud.
+        targets: (K, V, 3) displacement of the vertices per unit of each weight.
+        names: (K,) names of the targets; empty if the file has none.
+        weights: (K,) weights in the file.
+        extras: application-specific data of the mesh.
+        copyright: copyright notice of the file.
+        n_others: number of other meshes in the scene.
     """
 
     vertices: FloatArray
@@ -76,7 +76,7 @@ class Morphs:
 
 @dataclass
 class _Gltf:
-    """The JSON of a file and the buffers it names."""
+    """The JSON of a file and its buffers."""
 
     path: Path
     tree: dict[str, Any]
@@ -94,7 +94,7 @@ class _Gltf:
         uri = entry.get("uri")
         if uri is None and index != 0:
             raise self.compressed("a buffer has no data")
-        # By its name, for many buffers may be one file.
+        # The URI is the key, because several buffers may refer to one file.
         if uri not in self.buffers:
             data = self.binary if uri is None else self.fetch(uri)
             self.buffers[uri] = b"" if data is None else data
@@ -104,7 +104,7 @@ class _Gltf:
         return data
 
     def fetch(self, uri: str) -> bytes:
-        """Return the bytes of a buffer inside the JSON, or in a file beside it."""
+        """Return the bytes of a buffer inside the JSON, or in a file in its folder."""
         if uri.startswith("data:"):
             head, _, body = uri.partition(",")
             if not head.endswith(";base64"):
@@ -115,22 +115,20 @@ class _Gltf:
             target = (folder / unquote(uri)).resolve()
             is_there = target.exists()
         except OSError as error:  # a name too long for the system
-            raise damage_error(self.path, f"it names a buffer '{uri[:80]}' that is no file; {CUT_SHORT}") from error
+            raise damage_error(self.path, f"it names a buffer '{uri[:80]}' that is not a file; {CUT_SHORT}") from error
         if "://" in uri or not target.is_relative_to(folder):
-            raise damage_error(self.path, f"it names a buffer outside its own folder ('{uri[:80]}'), which is not read")
+            raise damage_error(self.path, f"it names a buffer outside its folder ('{uri[:80]}'), which is not read")
         if not is_there:
-            raise damage_error(self.path, f"its buffer '{uri[:80]}' is missing beside it; copy that file there too")
+            raise damage_error(self.path, f"its buffer '{uri[:80]}' is missing in its folder; copy that file there")
         try:
             data = read_bytes(target, max(LARGEST_MESH_FILE_BYTES - self.allowance.file_bytes, 0))
         except FileError as error:
-            raise damage_error(
-                self.path, f"its buffer '{uri[:80]}' is no file that can be read or it is too long"
-            ) from error
+            raise damage_error(self.path, f"its buffer '{uri[:80]}' cannot be read or is too long") from error
         self.allowance.more_file(len(data))
         return data
 
     def compressed(self, otherwise: str) -> FileFormatError:
-        """Return the error for data that are not there, by compression where the file says that it uses one."""
+        """Return the error for missing data, which names the compression that the file declares, if any."""
         used = self.tree.get("extensionsUsed", [])
         extension = next((name for name in _COMPRESSIONS if name in used), None)
         if extension is None:
@@ -155,7 +153,7 @@ class _Gltf:
         return np.ndarray((count, width), kind, data, start, (stride, kind.itemsize))
 
     def accessor(self, index: int) -> Values:
-        """Return the (count, width) values of an accessor; normalised whole numbers become float64."""
+        """Return the (count, width) values of an accessor; normalised integers become float64."""
         if index < 0:
             raise IndexError(index)
         entry = self.tree["accessors"][index]
@@ -163,7 +161,7 @@ class _Gltf:
         width, count = _WIDTHS[entry["type"]], int(entry["count"])
         if count < 0:
             raise ValueError("count")
-        # Every array becomes one of eight bytes a number.
+        # Every array is converted to eight bytes per number.
         self.allowance.take(count * width, 8)
         if "bufferView" in entry:
             values = self.view(entry["bufferView"], entry.get("byteOffset", 0), kind, count, width).copy()
@@ -187,30 +185,30 @@ def read_gltf(data: bytes, path: Path) -> Mesh:
     """Read glTF or GLB: all meshes of the scene in the order of its nodes, moved by the nodes' transforms.
 
     Primitives that share their positions share their vertices here too. Morph targets are applied with the
-    weights of the node or mesh; skins, lines and animations are passed over. glTF means metres. Colours are those of
-    the vertices, else of the pictures of base colour; a note says why these are not read.
+    weights of the node or mesh; skins, lines and animations are ignored. The unit of glTF is metres. Colours are those
+    of the vertices, or else of the base colour textures; a note gives the reason if a texture cannot be read.
 
     Args:
-        data: the whole file.
-        path: its name; buffers beside it are read from its folder and from nowhere else.
+        data: complete content of the file.
+        path: path of the file; external buffers are read from its folder only.
 
     Raises:
-        FileFormatError: it is not glTF 2.0, is cut short, is compressed, requires an extension that is not known,
-            holds no points, or makes more of its bytes than `io.limits` allows.
+        FileFormatError: it is not glTF 2.0, is cut short, is compressed, requires an unsupported extension,
+            contains no points, or exceeds the limits of `io.read_limits`.
         MeshError: faces that point past the end of the vertices.
     """
     return _parse(data, path, _scene)
 
 
 def read_morphs(data: bytes, path: Path) -> Morphs:
-    """Read the mesh with morph targets in glTF or GLB that has most vertices; the others are counted.
+    """Read the mesh with morph targets that has most vertices in glTF or GLB, and count the other meshes.
 
     Args:
-        data: the whole file.
-        path: its name; buffers beside it are read as in `read_gltf`.
+        data: complete content of the file.
+        path: path of the file; external buffers are read from its folder only.
 
     Raises:
-        FileFormatError: as `read_gltf`, or no mesh has morph targets.
+        FileFormatError: no mesh has morph targets, or see `read_gltf`.
     """
     return _parse(data, path, _morphs)
 
@@ -222,11 +220,11 @@ def _parse(data: bytes, path: Path, build: Callable[[_Gltf], Found]) -> Found:
     else:
         text = data
     tree = json_value(text, path)
-    # Any part of the JSON may be missing or of the wrong type, so that is met in this one place.
+    # Any part of the JSON may be missing or of the wrong type; such errors are handled here only.
     try:
         if not str(tree["asset"]["version"]).startswith("2"):
             raise damage_error(path, "it is not glTF of version 2")
-        _refuse_unknown(tree.get("extensionsRequired", []), path)
+        _check_extensions(tree.get("extensionsRequired", []), path)
         return build(_Gltf(path, tree, binary, Allowance(len(data), path)))
     except (FileError, InputError):
         raise
@@ -234,13 +232,13 @@ def _parse(data: bytes, path: Path, build: Callable[[_Gltf], Found]) -> Found:
         raise damage_error(path, f"it is not valid glTF; {CUT_SHORT}") from error
 
 
-def _refuse_unknown(required: list[Any], path: Path) -> None:
+def _check_extensions(required: list[Any], path: Path) -> None:
     for name in map(str, required):
         if name in _COMPRESSIONS:
             raise damage_error(path, f"it is compressed ({name}), so export it again without compression")
         if name not in _HARMLESS_TOO and not name.startswith(_HARMLESS):
             raise damage_error(
-                path, f"it requires the extension '{name[:60]}', which is not known here, so export it again without it"
+                path, f"it requires the extension '{name[:60]}', which is not supported, so export it again without it"
             )
 
 
@@ -264,7 +262,7 @@ def _chunks(data: bytes, path: Path) -> tuple[bytes, bytes | None]:
 
 
 def _nodes_with_meshes(gltf: _Gltf) -> Iterator[tuple[dict[str, Any], FloatArray]]:
-    """Yield the nodes of the scene that show a mesh, and the (4, 4) transforms from theirs to the scene's frame."""
+    """Yield the nodes of the scene with a mesh, and their (4, 4) transforms to the frame of the scene."""
     tree = gltf.tree
     nodes: list[Any] = tree.get("nodes", [])
     scenes: list[Any] = tree.get("scenes", [])
@@ -285,7 +283,7 @@ def _nodes_with_meshes(gltf: _Gltf) -> Iterator[tuple[dict[str, Any], FloatArray
         visited.add(index)
         gltf.allowance.part()
         node = nodes[index]
-        matrix = parent @ _local(node)
+        matrix = parent @ _local_transform(node)
         stack += [(int(child), matrix) for child in reversed(node.get("children", []))]
         if "mesh" in node:
             yield node, matrix
@@ -302,24 +300,24 @@ def _scene(gltf: _Gltf) -> Mesh:
             gltf.allowance.take(3 * (len(vertices) + (0 if triangles is None else len(triangles))), 8)
             points.append(vertices @ matrix[:3, :3].T + matrix[:3, 3])
             if triangles is not None:
-                faces.append(_outwards(triangles, matrix) + n_vertices)
+                faces.append(_keep_orientation(triangles, matrix) + n_vertices)
             colours.append(vertex_colours)
             n_vertices += len(vertices)
     if not points:
-        raise damage_error(gltf.path, "its scene holds no points and no triangles")
+        raise damage_error(gltf.path, "its scene contains no points and no triangles")
     joined = np.concatenate(faces) if faces else None
     return mesh_of(
-        np.concatenate(points), joined, gltf.path, _joined_colours(points, colours), tuple(dict.fromkeys(notes))
+        np.concatenate(points), joined, gltf.path, _join_colours(points, colours), tuple(dict.fromkeys(notes))
     )
 
 
-def _outwards(triangles: IndexArray, matrix: FloatArray) -> IndexArray:
-    """Return triangles (F, 3), turned where a transform (4, 4) is mirroring, which turns them inside out."""
+def _keep_orientation(triangles: IndexArray, matrix: FloatArray) -> IndexArray:
+    """Return triangles (F, 3), flipped if a transform (4, 4) is mirroring, which reverses their orientation."""
     return triangles[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else triangles
 
 
-def _joined_colours(points: list[FloatArray], colours: list[ByteArray | None]) -> ByteArray | None:
-    """Return the colours of all parts, grey where only others have some; None where none has."""
+def _join_colours(points: list[FloatArray], colours: list[ByteArray | None]) -> ByteArray | None:
+    """Return the colours of all parts, grey for parts without colours; None if no part has colours."""
     if all(part is None for part in colours):
         return None
     pairs = zip(points, colours, strict=True)
@@ -329,7 +327,7 @@ def _joined_colours(points: list[FloatArray], colours: list[ByteArray | None]) -
 
 
 def _morphs(gltf: _Gltf) -> Morphs:
-    """Return the mesh with morph targets of most vertices."""
+    """Return the mesh with morph targets that has most vertices."""
     mesh_nodes = list(_nodes_with_meshes(gltf))
     sizes = [_morphed_vertices(gltf, node) for node, _ in mesh_nodes]
     if not any(sizes):
@@ -338,7 +336,7 @@ def _morphs(gltf: _Gltf) -> Morphs:
     mesh = gltf.tree["meshes"][node["mesh"]]
     count = len(mesh["primitives"][0]["targets"])
     gltf.allowance.part(count)
-    # Without its weights, so that what is read is the shape from which the targets are counted.
+    # Without weights, so that the result is the base shape, to which the targets are relative.
     parts = _primitives(gltf, {"mesh": node["mesh"], "weights": ()}, [])
     vertices = np.concatenate([points for points, *_ in parts])
     gltf.allowance.take(vertices.size * (count + 1), 8)
@@ -351,7 +349,7 @@ def _morphs(gltf: _Gltf) -> Morphs:
             if "POSITION" in target:
                 targets[k, n_vertices:end] = gltf.accessor(target["POSITION"]).reshape(len(points), 3)
         if triangles is not None:
-            faces.append(_outwards(triangles, matrix) + n_vertices)
+            faces.append(_keep_orientation(triangles, matrix) + n_vertices)
         n_vertices = end
     rotation = matrix[:3, :3]
     extras: Any = mesh.get("extras", {})
@@ -380,7 +378,7 @@ def _morphed_vertices(gltf: _Gltf, node: dict[str, Any]) -> int:
     )
 
 
-def _local(node: dict[str, Any]) -> FloatArray:
+def _local_transform(node: dict[str, Any]) -> FloatArray:
     """Return the (4, 4) transform of a node, from its matrix or its translation, rotation and scale."""
     if "matrix" in node:
         return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
@@ -399,7 +397,7 @@ def _local(node: dict[str, Any]) -> FloatArray:
 def _primitives(
     gltf: _Gltf, node: dict[str, Any], notes: list[str]
 ) -> list[tuple[FloatArray, IndexArray | None, ByteArray | None, dict[str, Any]]]:
-    """Return points, triangles and colours of a node's mesh, and the first primitive of those that share positions."""
+    """Return points, triangles, colours and first primitive of each group of primitives that share positions."""
     mesh = gltf.tree["meshes"][node["mesh"]]
     weights = node.get("weights", mesh.get("weights", []))
     vertices: dict[int, FloatArray] = {}
@@ -433,14 +431,14 @@ def _primitives(
             corner_triples = corners.reshape(-1, 3)
         else:
             corner_triples = (strip_triangles if mode == _STRIP else fan_triangles)([len(corners)], corners)
-        # Checked here: joined, an index past this primitive would point into the next.
+        # Checked before joining, which would make an index past this primitive refer to the next one.
         mesh_of(vertices[key], corner_triples, gltf.path)
         triangles.setdefault(key, []).append(corner_triples)
     return [(v, np.concatenate(triangles[k]) if k in triangles else None, *first[k]) for k, v in vertices.items()]
 
 
 def _colours(gltf: _Gltf, primitive: dict[str, Any], vertices: int, notes: list[str]) -> ByteArray | None:
-    """Return the colours (V, 3) of the points of a primitive; None where it has none, or none that can be read."""
+    """Return the colours (V, 3) of the points of a primitive; None if it has no readable colours."""
     attributes = primitive["attributes"]
     try:
         if "COLOR_0" in attributes:
@@ -455,7 +453,7 @@ def _colours(gltf: _Gltf, primitive: dict[str, Any], vertices: int, notes: list[
         uv = gltf.accessor(coordinates).astype(np.float64)
         if len(uv) != vertices or uv.shape[1] != 2:
             return None
-        # Of glTF the upper left corner is the origin.
+        # The origin of texture coordinates of glTF is the upper left corner.
         uv[:, 1] = 1.0 - uv[:, 1]
         uri = str(image.get("uri", ""))
         if not uri or uri.startswith("data:"):
@@ -466,7 +464,7 @@ def _colours(gltf: _Gltf, primitive: dict[str, Any], vertices: int, notes: list[
         notes.append(f"It is read without all of its colours: {reason}.")
         return None
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError, FileError):
-        return None  # the surface is whole, whatever its material lacks
+        return None  # a damaged material does not affect the surface
 
 
 def _picture(gltf: _Gltf, image: dict[str, Any]) -> bytes:
@@ -478,7 +476,7 @@ def _picture(gltf: _Gltf, image: dict[str, Any]) -> bytes:
 
 
 def _from_linear(values: Values) -> ByteArray | None:
-    """Return colours (N, 3) that are linear in light, 0 to 1, as screens show them (sRGB)."""
+    """Return sRGB colours (N, 3) of linear colours from 0 to 1."""
     light = values.astype(np.float64) / (1.0 if values.dtype.kind == "f" else np.iinfo(values.dtype).max)
     if not np.isfinite(light).all():
         return None
@@ -488,7 +486,7 @@ def _from_linear(values: Values) -> ByteArray | None:
 
 
 def _to_linear(colours: ByteArray) -> Values:
-    """Return (N, 4) uint16 of sRGB colours (N, 3), linear in light and opaque, fine enough to come back as they are."""
+    """Return linear opaque colours (N, 4) uint16 of sRGB colours (N, 3), precise enough for an exact round trip."""
     srgb = np.arange(256) / 255.0
     light = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
     out = np.full((len(colours), 4), 65535, dtype="<u2")
@@ -497,7 +495,7 @@ def _to_linear(colours: ByteArray) -> Values:
 
 
 class GltfBuffer:
-    """Binary data of a file to write, with the place of each array in it."""
+    """Binary data of a file to write, with the position of each array."""
 
     def __init__(self) -> None:
         self.parts: list[bytes] = []
@@ -506,7 +504,7 @@ class GltfBuffer:
         self.is_finite = True
 
     def vectors(self, values: FloatArray, *, bounds: bool = True) -> int:
-        """Add (V, 3) vectors in single precision and return the number of their accessor; positions state bounds."""
+        """Add vectors (V, 3) in single precision, positions with bounds, and return the index of their accessor."""
         with np.errstate(over="ignore"):
             single = values.astype("<f4")
         self.is_finite &= bool(np.isfinite(single).all())
@@ -514,11 +512,11 @@ class GltfBuffer:
         return self._add(single, _VERTICES, type="VEC3", **limits)
 
     def indices(self, faces: IntArray) -> int:
-        """Add triangles and return the number of their accessor."""
+        """Add triangles and return the index of their accessor."""
         return self._add(faces.astype("<u4").reshape(-1), _CORNERS, type="SCALAR")
 
     def colours(self, colours: ByteArray) -> int:
-        """Add colours (V, 3) and return the number of their accessor."""
+        """Add colours (V, 3) and return the index of their accessor."""
         return self._add(_to_linear(colours), _VERTICES, type="VEC4", normalized=True)
 
     def _add(self, values: Values, target: int, **kind: Any) -> int:
@@ -534,7 +532,7 @@ class GltfBuffer:
     def content(
         self, mesh: Mapping[str, Any], name: str, centre: FloatArray, **asset: str
     ) -> tuple[dict[str, Any], bytes]:
-        """Return the tree of a scene with one mesh, whose positions are from `centre` (3,), and its buffer."""
+        """Return the JSON of a scene with one mesh, whose positions are relative to `centre` (3,), and its buffer."""
         translation = {"translation": centre.tolist()} if centre.any() else {}
         tree = {
             "asset": {"version": "2.0", "generator": "shapespace", **asset},
@@ -549,7 +547,7 @@ class GltfBuffer:
 
 
 def centre_if_far(points: FloatArray) -> FloatArray:
-    """Return (3,) the centre of points (V, 3) that are far from the origin for their size, else zeros."""
+    """Return the centre (3,) of points (V, 3) that are far from the origin relative to their size, else zeros."""
     low, high = points.min(axis=0), points.max(axis=0)
     extent = max(float((high - low).max()), np.finfo(np.float64).tiny)
     return (low + high) / 2 if np.abs([low, high]).max() > _FAR * extent else np.zeros(3)
@@ -559,7 +557,7 @@ def _content(mesh: Mesh) -> tuple[dict[str, Any], bytes]:
     if not len(mesh.vertices):
         raise InputError(f"{mesh.name} has no points, so it cannot be written as glTF.")
     if not np.isfinite(mesh.vertices).all():
-        raise InputError(f"{mesh.name} has points that are not finite, which glTF cannot hold; write it as PLY.")
+        raise InputError(f"{mesh.name} has points that are not finite, which glTF cannot store; write it as PLY.")
     centre, buffer = centre_if_far(mesh.vertices), GltfBuffer()
     primitive: dict[str, Any] = {"attributes": {"POSITION": buffer.vectors(mesh.vertices - centre)}, "mode": _POINTS}
     if not buffer.is_finite:
@@ -572,7 +570,7 @@ def _content(mesh: Mesh) -> tuple[dict[str, Any], bytes]:
 
 
 def write_gltf(mesh: Mesh) -> bytes:
-    """Return `mesh` as one glTF JSON file with its buffer inside, in float32; numbers stay as they are.
+    """Return `mesh` as one glTF JSON file with its buffer inside, in float32; coordinates are not converted to metres.
 
     Raises:
         InputError: no points, or coordinates that are not finite or too large for float32.
@@ -581,7 +579,7 @@ def write_gltf(mesh: Mesh) -> bytes:
 
 
 def write_glb(mesh: Mesh) -> bytes:
-    """Return `mesh` as binary glTF, in float32; numbers are written as they are, though glTF means metres.
+    """Return `mesh` as binary glTF, in float32; coordinates are not converted to metres, the unit of glTF.
 
     Raises:
         InputError: no points, or coordinates that are not finite or too large for float32.

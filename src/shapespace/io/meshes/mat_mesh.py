@@ -14,7 +14,7 @@ from shapespace.io.sandbox import HDF5_SIGNATURE, SandboxError, Tree, read_matla
 from shapespace.types import Mesh
 
 _HDF5_AT = 512  # MAT-file 7.3: HDF5 begins after a user block of 512 bytes
-_MOST_VARIABLES = 64  # limit on what one file may ask to be read
+_MOST_VARIABLES = 64  # limit of the variables that are read
 _SAVE = (
     "save it in MATLAB by s = struct('Vertices', T.Vertices, 'Faces', T.Faces); save('t.mat', '-struct', 's', '-v7')"
 )
@@ -24,18 +24,18 @@ def read_mat_mesh(data: bytes, path: Path) -> Mesh:
     """Read the mesh of a MATLAB file of version 4 to 7: vertices in rows or columns, triangles that count from 1.
 
     Args:
-        data: the whole file.
-        path: the file, which is read by MATLAB's readers in a process apart.
+        data: complete content of the file.
+        path: path of the file, which is read by scipy in a sandboxed process.
 
     Raises:
-        FileFormatError: it holds no such structure, as those with objects of MATLAB do, is damaged, or is of version
+        FileFormatError: it contains no such structure (for example, only MATLAB objects), is damaged, or is of version
             7.3.
         MeshError: faces that point past the end of the vertices.
     """
     if HDF5_SIGNATURE in (data[: len(HDF5_SIGNATURE)], data[_HDF5_AT : _HDF5_AT + len(HDF5_SIGNATURE)]):
         raise damage_error(path, f"it is of MATLAB 7.3; {_SAVE}")
     try:
-        # What it holds is not known before: once for the names, once for what they stand for.
+        # The file is read twice: first the names of its variables, then their values.
         names = [name.removeprefix("/") for name in read_matlab_sandboxed(path, ()).groups]
         tree = read_matlab_sandboxed(path, names[:_MOST_VARIABLES])
     except SandboxError as error:
@@ -47,9 +47,7 @@ def read_mat_mesh(data: bytes, path: Path) -> Mesh:
     points = vertices if vertices.shape[1] == 3 else vertices.T
     corners = faces if faces.shape[1] == 3 else faces.T
     if points.shape[1] != 3 or corners.shape[1] != 3 or not np.isfinite(corners).all():
-        raise damage_error(
-            path, f"its Vertices are of the shape {vertices.shape} and its Faces of {faces.shape}; {_SAVE}"
-        )
+        raise damage_error(path, f"its Vertices have the shape {vertices.shape} and its Faces {faces.shape}; {_SAVE}")
     with np.errstate(invalid="ignore"):
         return mesh_of(points, corners.astype(np.int64) - 1, path)
 

@@ -1,4 +1,4 @@
-"""Readers and writers of meshes and point clouds, selected by file name ending from one dict, and lists of them."""
+"""Readers and writers of meshes and point clouds, selected by file name ending, and lists of mesh files."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from shapespace.reprs import first_names
 from shapespace.types import Mesh, require
 
 _PACKED = ".gz"
-_PROBED_BYTES = 2**16  # 64 KiB hold any usual header
+_PROBED_BYTES = 2**16  # 64 KiB contain any usual header
 _Probe: TypeAlias = Callable[[bytes, int, Path], None]
 _PROBES: Mapping[str, _Probe] = {".ply": probe_ply, ".stl": probe_stl}
 _CONVERT: Mapping[str, str] = {
@@ -38,14 +38,14 @@ _CONVERT: Mapping[str, str] = {
     ".laz": "convert it to PLY",
     ".raw": "convert a mesh to PLY, a volume to NRRD or NIfTI",
 }
-"""File name ending -> what to do with a file that is not read."""
+"""File name ending -> advice for files that cannot be read."""
 _LEFT_OUT: Mapping[str, tuple[str, str, str, str]] = {
-    "folder": ("folder", "folders", "looked into", "--recursive takes the {} there"),
+    "folder": ("folder", "folders", "searched", "give --recursive to include the {} there"),
     "linked": ("link to a folder", "links to folders", "followed", "give that folder too"),
-    "broken": ("broken link", "broken links", "taken", "mend or remove it"),
-    "packed": ("compressed file", "compressed files", "taken", "unpack them with gunzip first"),
+    "broken": ("broken link", "broken links", "used", "repair or remove it"),
+    "packed": ("compressed file", "compressed files", "used", "unpack them with gunzip first"),
 }
-"""Kind of what is not taken from a folder -> one, several, what is not done with them, and advice."""
+"""Kind of skipped entry of a folder -> singular, plural, participle for the message, and advice."""
 
 
 @dataclass(frozen=True)
@@ -53,12 +53,12 @@ class MeshFormat:
     """A file format for surfaces.
 
     Args:
-        name: what people call it.
-        read: (content, path) -> mesh; the path is for messages and for files beside it.
-        write: mesh -> content.
-        exact: whether float64 coordinates survive writing and reading.
-        point_clouds: whether it can hold points without triangles.
-        keeps_vertices: whether order and number of the vertices survive.
+        name: common name of the format.
+        read: function (content, path) -> mesh; the path is used in messages and to find companion files.
+        write: function mesh -> content.
+        exact: whether float64 coordinates are preserved exactly.
+        point_clouds: whether it can store points without triangles.
+        keeps_vertices: whether order and number of the vertices are preserved.
     """
 
     name: str
@@ -70,22 +70,22 @@ class MeshFormat:
 
 
 def read_mesh(path: Path | str) -> Mesh:
-    """Read a surface or point cloud; its name is the file's name.
+    """Read a surface or point cloud, named after its file.
 
     Vertices keep the order and number of the file, its frame and its unit (STL has no vertices, only corners:
-    equal ones are merged in the order of first appearance). Polygons become fans of triangles.
+    equal corners are merged in the order of first appearance). Polygons become fans of triangles.
 
     Args:
-        path: a file with one of the endings in `MESH_ENDINGS` or `NAMED_FORMATS`, in any case, packed by gzip
-            (`.ply.gz`) or not.
+        path: path of a file with one of the endings in `MESH_ENDINGS` or `NAMED_FORMATS`, in upper or lower case,
+            optionally compressed by gzip (`.ply.gz`).
 
     Returns:
-        The mesh as the file has it, with whatever is wrong with it.
+        The mesh as in the file, including any defects.
 
     Raises:
         FileError: it does not exist, cannot be read, is no file, or is longer than `LARGEST_MESH_FILE_BYTES`.
-        FileFormatError: the ending is unknown, or the content is not in that format, cut short, damaged, or out of
-            proportion to the file (`io.limits`).
+        FileFormatError: the ending is unknown, or the content is not in that format, cut short, damaged, or
+            exceeds the limits of `io.read_limits`.
         MeshError: faces that point past the end of the vertices.
     """
     path = Path(path)
@@ -96,20 +96,20 @@ def read_mesh(path: Path | str) -> Mesh:
         data = unpack_gzip(data, path, LARGEST_MESH_FILE_BYTES)
     if not data.strip():
         raise FileFormatError(f"Cannot read {path}: it is empty; export or copy it again.")
-    # A NaN or infinity is for the mesh doctor to judge, not for numpy to warn about.
+    # The mesh doctor reports NaN and infinity; warnings of numpy would be redundant.
     with np.errstate(invalid="ignore", over="ignore"):
         return read(data, path)
 
 
 def probe_mesh(path: Path) -> None:
-    """Check a mesh file by its first 64 KiB and its size, without reading all of it.
+    """Check a mesh file by its first 64 KiB and its size, without reading the complete file.
 
-    The file must open, have a known ending, not be empty and not be too long; PLY and binary STL must be as long as
-    their header declares. A file that passes may still be damaged further on.
+    The file must be readable, have a known ending, not be empty and not be too long; PLY and binary STL must be as long
+    as their header declares. A file that passes may still be damaged in a later part.
 
     Raises:
-        FileError: as `read_mesh`.
-        FileFormatError: as `read_mesh`.
+        FileError: see `read_mesh`.
+        FileFormatError: see `read_mesh`.
     """
     ending = ending_of(path)
     if ending not in READ_ONLY_FORMATS and ending not in NAMED_FORMATS:
@@ -117,7 +117,7 @@ def probe_mesh(path: Path) -> None:
     with open_file(path) as stream, reading(path):
         size, head = os.fstat(stream.fileno()).st_size, stream.read(_PROBED_BYTES)
     if size > LARGEST_MESH_FILE_BYTES:
-        read_bytes(path, LARGEST_MESH_FILE_BYTES)  # refuses it
+        read_bytes(path, LARGEST_MESH_FILE_BYTES)  # raises the error
     if not head.strip():
         raise FileFormatError(f"Cannot read {path}: it is empty; export or copy it again.")
     if not head.startswith(GZIP) and ending in _PROBES:
@@ -125,16 +125,16 @@ def probe_mesh(path: Path) -> None:
 
 
 def write_mesh(path: Path | str, mesh: Mesh) -> None:
-    """Write `mesh` in the format of the ending of `path`, whole or not at all; landmarks are not written.
+    """Write `mesh` in the format of the ending of `path`, atomically; landmarks are not written.
 
     Args:
-        path: the file, with one of the endings in `MESH_FORMATS`.
-        mesh: vertices in whatever unit they are in; PLY, OBJ, OFF, VTK and VTP keep float64 exactly.
+        path: path of the file, with one of the endings in `MESH_FORMATS`.
+        mesh: mesh in any unit; PLY, OBJ, OFF, VTK and VTP store float64 coordinates exactly.
 
     Raises:
         FileFormatError: the ending is unknown.
         FileError: the folder cannot be written, or the disk is full.
-        InputError: the format cannot hold this mesh (STL without triangles, float32 overflow).
+        InputError: the format cannot store this mesh (STL without triangles, float32 overflow).
     """
     require(mesh, Mesh, "write_mesh", "convert it with shapespace.as_mesh")
     path = Path(path)
@@ -142,7 +142,7 @@ def write_mesh(path: Path | str, mesh: Mesh) -> None:
 
 
 def ending_of(path: PurePath | str) -> str:
-    """Return the ending that tells the format, in small letters: `.ply` of `a.PLY` and of `a.ply.gz`."""
+    """Return the ending that determines the format, in lower case: `.ply` of `a.PLY` and of `a.ply.gz`."""
     return _unpacked_name(path).suffix.lower()
 
 
@@ -194,13 +194,13 @@ READ_ONLY_FORMATS: Mapping[str, Callable[[bytes, Path], Mesh]] = MappingProxyTyp
 """File name ending -> reader (content, path) -> mesh, for formats that are not written."""
 
 NAMED_FORMATS: Mapping[str, Callable[[bytes, Path], Mesh]] = MappingProxyType({".mat": read_mat_mesh})
-"""The same for endings under which most files are none, so that those are read where they are named, not in folders."""
+"""Readers for endings that many other files share; such files are read if they are named, but not from folders."""
 
 MESH_ENDINGS = (*MESH_FORMATS, *READ_ONLY_FORMATS)
-"""The endings that `read_mesh` takes."""
+"""File name endings that `read_mesh` accepts."""
 
 MESH_FILE_ENDINGS = (*MESH_ENDINGS, *(f"{ending}{_PACKED}" for ending in MESH_ENDINGS))
-"""With those of files packed by gzip."""
+"""File name endings of meshes, including those of files compressed by gzip."""
 
 
 @dataclass(frozen=True)
@@ -208,8 +208,8 @@ class MeshFiles:
     """Result of `mesh_files`.
 
     Args:
-        files: in the order given, those of a folder in the order of their names.
-        left_out: a sentence for each kind of thing that was not taken.
+        files: paths in the given order, those of a folder in the order of their names.
+        left_out: a sentence for each kind of skipped entry.
     """
 
     files: tuple[Path, ...]
@@ -224,14 +224,14 @@ def mesh_files(
     endings: Sequence[str] = MESH_FILE_ENDINGS,
     kind_name: str = "meshes",
 ) -> MeshFiles:
-    """Return `paths` with each folder replaced by the meshes in it, or by other files of some kind.
+    """Return `paths` with each folder replaced by its meshes, or by its files with other `endings`.
 
     Args:
-        paths: files, taken as they are, and folders.
-        recursive: whether to take what lies in folders below these too. Links to folders are not followed.
-        apart_from: a folder below that is not looked into, such as that of the results.
-        endings: of the files to take, in small letters.
-        kind_name: they are called.
+        paths: files, which are always included, and folders.
+        recursive: whether to include files in subfolders. Links to folders are not followed.
+        apart_from: subfolder to skip, such as that of the results.
+        endings: endings of the files to include, in lower case.
+        kind_name: plural noun of the files in messages.
 
     Raises:
         InputError: a folder without meshes.
@@ -250,10 +250,10 @@ def mesh_files(
         for kind, entry in _entries(path, tuple(endings), recursive, apart):
             found[kind].append(entry)
         if not found["file"]:
-            advice = "; give --recursive for what lies in the folders below it" if found["folder"] else ""
+            advice = "; give --recursive to include its subfolders" if found["folder"] else ""
             advice += "; unpack those that are compressed with gunzip" if found["packed"] else ""
             known = MESH_ENDINGS if endings is MESH_FILE_ENDINGS else endings
-            raise InputError(f"{path} holds no {kind_name}{advice}; shapespace reads {', '.join(known)}.")
+            raise InputError(f"{path} contains no {kind_name}{advice}; shapespace reads {', '.join(known)}.")
         files += found["file"]
         for kind, (singular, plural, verb, advice) in _LEFT_OUT.items():
             if names := [entry.relative_to(path).as_posix() for entry in found[kind]]:
@@ -266,7 +266,7 @@ def mesh_files(
 def _entries(
     folder: Path, endings: tuple[str, ...], recursive: bool, apart_from: Path | None
 ) -> Iterator[tuple[str, Path]]:
-    """Yield the files to take from a folder, as `file`, and what is left out, as a kind of `_LEFT_OUT`, by name."""
+    """Yield kind and path of each entry of a folder, by name: `file` to include, or a kind of `_LEFT_OUT` to skip."""
     packed_endings = tuple(f"{ending}{_PACKED}" for ending in endings)
     with reading(folder):
         for path in sorted(p for p in folder.iterdir() if not p.name.startswith(".")):

@@ -1,4 +1,4 @@
-"""Wavefront OBJ: `v` and `f` lines, and vertex colours, also of the textures of materials (`mtllib`, `map_Kd`).
+"""Wavefront OBJ: `v` and `f` lines, and colours of vertices or of the textures of materials (`mtllib`, `map_Kd`).
 
 Texture seams, normals and groups are ignored.
 """
@@ -35,22 +35,22 @@ from shapespace.io.parsing import (
 from shapespace.types import GREY, ByteArray, FloatArray, Mesh
 
 _COLOURED_WORDS = 7
-"""Of a line such as `v x y z r g b`."""
+"""Number of words of a line `v x y z r g b`."""
 _LIBRARIES = re.compile(rb"^[ \t]*mtllib[ \t]+([^\r\n]+)", re.MULTILINE)
 _LARGEST_LIBRARIES = 2**22
-"""Limit of the bytes of all materials files of one surface (4 MiB); those of scanners have some hundred."""
+"""Limit of the total size of the materials files of a surface (4 MiB); files of scanners have some hundred bytes."""
 _LIBRARY, _PICTURE = "its materials file", "its picture"
 
 
 def read_obj(data: bytes, path: Path) -> Mesh:
     """Read OBJ: one vertex for each `v` line, in the file's order, and polygons as fans.
 
-    Negative indices count back from the last `v` line above. Colours are those after `x y z` where all vertices have
-    them, else of the pictures that its materials name; a note says why these are not read. Weights are ignored.
+    Negative indices count back from the last `v` line above. Colours are those after `x y z` if all vertices have them,
+    or else of the textures of its materials; a note gives the reason if a texture cannot be read. Weights are ignored.
 
     Args:
-        data: the whole file.
-        path: its name; materials and pictures are read from its folder and from nowhere else.
+        data: complete content of the file.
+        path: path of the OBJ file; materials and textures are read from its folder only.
 
     Raises:
         FileFormatError: it has no `v` line, a line with too few numbers, or an index of zero.
@@ -86,13 +86,13 @@ def read_obj(data: bytes, path: Path) -> Mesh:
             faces.append(_faces(polygons, vertices_above, polygon_count, path))
             polygon_count += len(polygons)
     if not count:
-        raise damage_error(path, "it has no 'v' lines, so it is not an OBJ file or holds no points")
+        raise damage_error(path, "it has no 'v' lines, so it is not an OBJ file or contains no points")
     vertex_colours = joined_colours(colours)
     notes: tuple[str, ...] = ()
     if vertex_colours is None:
         vertex_colours, notes = _texture_colours(data, count, path)
     if b"\nl " in data:
-        notes = (*notes, "Its lines (l) are no surface, and their points alone are read; save them as VTK for curves.")
+        notes = (*notes, "Its lines (l) are not a surface; only their points are read. Save them as VTK for curves.")
     header = data[: data.find(b"\nv")]
     return mesh_of(np.concatenate(vertices), join_parts(faces, np.int64, 3), path, vertex_colours, notes, header=header)
 
@@ -109,7 +109,7 @@ def _points(points: list[list[bytes]], lines_before: int, path: Path) -> FloatAr
 
 
 def _faces(polygons: list[list[bytes]], vertices_above: list[int], lines_before: int, path: Path) -> IndexArray:
-    # A comment after the corners is rare, and is looked for only where there is a mark.
+    # Comments after the corners are rare; lines are parsed again only if one contains a mark.
     if any(b"#" in word for words in polygons for word in (words[-1], *words[4:])):
         polygons = [b" ".join(words).partition(b"#")[0].split() for words in polygons]
     counts = np.fromiter(map(len, polygons), dtype=np.int64, count=len(polygons)) - 1
@@ -128,14 +128,14 @@ def _faces(polygons: list[list[bytes]], vertices_above: list[int], lines_before:
 
 
 def _texture_colours(data: bytes, vertices: int, path: Path) -> tuple[ByteArray | None, tuple[str, ...]]:
-    """Return the colours (V, 3) of a surface from its pictures, or None, and what kept them from being read.
+    """Return the colours (V, 3) of a surface from its textures, or None, and notes on the reason.
 
-    A vertex takes the colour at the first of its corners; one that no textured face uses is grey.
+    A vertex has the colour at its first corner; vertices without a textured face are grey.
 
     Args:
-        data: of the OBJ file, found to be whole.
-        vertices: V.
-        path: of the OBJ file; materials and pictures are read from its folder and from nowhere else.
+        data: content of the OBJ file, already checked for damage.
+        vertices: number of vertices, V.
+        path: path of the OBJ file; materials and textures are read from its folder only.
     """
     libraries = _LIBRARIES.findall(data)
     if not libraries or b"vt" not in data:
@@ -151,7 +151,7 @@ def _texture_colours(data: bytes, vertices: int, path: Path) -> tuple[ByteArray 
 
 
 def _libraries(files: CompanionFiles, names: Iterable[bytes]) -> dict[bytes, str]:
-    """Return material -> name of its picture, of all materials files; each is read once, however it is spelled."""
+    """Return material -> name of its picture, of all materials files; a file with several spellings is read once."""
     paths = dict.fromkeys(files.find(name.strip().decode("utf-8", "replace"), _LIBRARY) for name in names)
     pictures: dict[bytes, str] = {}
     left = _LARGEST_LIBRARIES
@@ -172,7 +172,7 @@ def _pictures(library: bytes) -> dict[bytes, str]:
         if key == b"newmtl":
             material = value
         elif key.lower() == b"map_kd" and value:
-            # Options such as -s 1 1 1 stand before the name, which else may hold spaces.
+            # Options such as -s 1 1 1 precede the name; a name without options may contain spaces.
             pictures[material] = (value.split()[-1] if value.startswith(b"-") else value).decode("utf-8", "replace")
     return pictures
 
@@ -183,7 +183,7 @@ def _colours(data: bytes, vertices: int, pictures: dict[bytes, str], files: Comp
         return None
     vertex_rows, texture = corners[:, 0], corners[:, 1]
     is_valid = (vertex_rows >= 0) & (vertex_rows < vertices) & (texture >= 0) & (texture < len(uv))
-    # Of equal indices numpy keeps the last, and the first corner is wanted.
+    # For equal indices, numpy assigns the last value; reversed, it is that of the first corner.
     first = np.full(vertices, -1, dtype=np.int64)
     first[vertex_rows[is_valid][::-1]] = np.flatnonzero(is_valid)[::-1]
     out = np.full((vertices, 3), GREY, dtype=np.uint8)
@@ -194,7 +194,7 @@ def _colours(data: bytes, vertices: int, pictures: dict[bytes, str], files: Comp
     names = [pictures.get(name) if is_used else None for name, is_used in zip(materials, used, strict=True)]
     targets = {name: files.find(name, _PICTURE) for name in names if name is not None}
     numbers = {target: number for number, target in enumerate(dict.fromkeys(targets.values()))}
-    # The number of the picture of each material, -1 for none, and so of each vertex.
+    # The index of the picture of each material, -1 for none, and then of each vertex.
     of_material = np.array([-1 if name is None else numbers[targets[name]] for name in names], dtype=np.int64)
     of_vertex = of_material[material]
     order = np.argsort(of_vertex, kind="stable")
@@ -208,7 +208,7 @@ def _colours(data: bytes, vertices: int, pictures: dict[bytes, str], files: Comp
 
 
 def _corners(data: bytes) -> tuple[np.ndarray, np.ndarray, dict[bytes, int]]:
-    """Return the texture coordinates (T, 2), of each corner its vertex, coordinate and material, and these by name."""
+    """Return texture coordinates (T, 2), the vertex, coordinate and material of each corner, and material indices."""
     uv, corners = array("d"), array("q")
     materials: dict[bytes, int] = {b"": 0}
     n_vertices = current = 0

@@ -36,8 +36,8 @@ def read_off(data: bytes, path: Path) -> Mesh:
     """Read OFF (also COFF, NOFF, CNOFF, NCOFF, STOFF): polygons become fans.
 
     Args:
-        data: the whole file.
-        path: its name, for messages and the mesh's name.
+        data: complete content of the file.
+        path: path of the file, used in messages and as the name of the mesh.
 
     Raises:
         FileFormatError: it is not text OFF in three dimensions, or it is cut short.
@@ -53,11 +53,11 @@ def read_off(data: bytes, path: Path) -> Mesh:
     head = [first[0][keyword.end() :], *first[1:]] if len(first[0]) > keyword.end() else first[1:]
     counts = ints((head or next(rows, first[:0]))[:2], path).tolist()
     if len(counts) < 2:
-        raise damage_error(path, f"it does not say how many vertices and faces it has; {CUT_SHORT}")
+        raise damage_error(path, f"it does not state the numbers of vertices and faces; {CUT_SHORT}")
     n, m = counts
     check_count(n, 6, len(data), "vertices", path)
     check_count(m, 2, len(data), "faces", path)
-    # Normals stand before colours, whichever the keyword names first.
+    # Normals precede colours, regardless of their order in the keyword.
     kinds = keyword[1] or b""
     colour_column = 0 if b"C" not in kinds else 6 if b"N" in kinds else 3
     points: list[FloatArray] = []
@@ -102,7 +102,7 @@ def _faces(rows: list[list[bytes]], path: Path) -> IndexArray:
     sizes = ints((words[0] for words in rows), path)
     lengths = np.fromiter(map(len, rows), dtype=np.int64, count=len(rows))
     if (sizes < 1).any() or (lengths <= sizes).any():
-        raise damage_error(path, f"a face has fewer corners than it says; {CUT_SHORT}")
+        raise damage_error(path, f"a face has fewer corners than it declares; {CUT_SHORT}")
     corners = ints(chain.from_iterable(w[1 : 1 + k] for w, k in zip(rows, sizes.tolist(), strict=True)), path)
     return fan_triangles(sizes, corners)
 

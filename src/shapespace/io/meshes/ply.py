@@ -41,10 +41,10 @@ _SCALARS = {
 _FLOATS = {"f4", "f8"}
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _MAX_HEADER = 1 << 20  # bytes (1 MiB)
-_FIRST_LINES = 512  # bytes that hold the comment
+_FIRST_LINES = 512  # bytes that contain the comment
 _COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 _OBSERVED, _POSITION_STD = "observed", "position_std"
-"""Vertex properties of surfaces in correspondence: 0 where the position is an estimate; `Mesh.position_std`."""
+"""Vertex properties of meshes in correspondence: 0 for estimated positions, else 1; and `Mesh.position_std`."""
 _INDEX_LISTS = ("vertex_indices", "vertex_index")
 
 
@@ -62,13 +62,13 @@ class _Element:
     properties: list[_Property]
 
     def least_bytes(self, ascii_text: bool) -> int:
-        """Return the least that one row takes: an ascii value needs a digit and a separator."""
+        """Return the smallest size of a row in bytes; an ascii value takes a digit and a separator."""
         if ascii_text:
             return 2 * len(self.properties)
         return sum(np.dtype(p.count or p.item).itemsize for p in self.properties)
 
     def index_list(self) -> int | None:
-        """Where the list of corners is among the properties."""
+        """Index of the list of corners among the properties; None without one."""
         places = (i for i, p in enumerate(self.properties) if p.count is not None and p.name in _INDEX_LISTS)
         return next(places, None)
 
@@ -81,11 +81,11 @@ def read_ply(data: bytes, path: Path) -> Mesh:
     """Read PLY: all scalar types, both byte orders, colours, extra properties and elements, polygons as fans.
 
     Args:
-        data: the whole file.
-        path: its name, for messages and the mesh's name.
+        data: complete content of the file.
+        path: path of the file, used in messages and as the name of the mesh.
 
     Raises:
-        FileFormatError: it is not PLY, is cut short, or holds triangle strips.
+        FileFormatError: it is not PLY, is cut short, or contains triangle strips.
         MeshError: faces that point past the end of the vertices.
     """
     data = plain_text(data)
@@ -97,7 +97,7 @@ def read_ply(data: bytes, path: Path) -> Mesh:
     is_text, cursor = order == "", WordCursor(data, path, offset)
     for element in elements:
         if element.name == "tristrips":
-            raise damage_error(path, "it holds triangle strips, so export it again with plain triangles")
+            raise damage_error(path, "it contains triangle strips, so export it again with plain triangles")
         available = cursor.left if is_text else len(data) - cursor.position
         check_count(element.count, element.least_bytes(is_text), available, _plural(element.name), path)
         has_faces = element.name == "face" and element.count > 0
@@ -108,7 +108,7 @@ def read_ply(data: bytes, path: Path) -> Mesh:
             read_lists = _ascii_lists if is_text else _binary_lists
             counts, corners = read_lists(cursor, element, order, list_index)
             if element.name == "vertex":
-                raise damage_error(path, "its vertices carry lists, so export it again without them")
+                raise damage_error(path, "its vertices have list properties, so export it again without them")
             if list_index is not None:
                 if len(counts) and counts.min() < 0:
                     raise damage_error(path, f"a face has {int(counts.min())} corners; {CUT_SHORT}")
@@ -127,12 +127,12 @@ def read_ply(data: bytes, path: Path) -> Mesh:
 
 
 def probe_ply(head: bytes, size: int, path: Path) -> None:
-    """Check that a PLY file is as long as its header declares, where faces have three corners or more.
+    """Check that a PLY file is at least as long as its header declares, with three or more corners per face.
 
     Args:
-        head: the first bytes of the file.
-        size: of the file in bytes.
-        path: its name, for messages.
+        head: first bytes of the file.
+        size: size of the file, bytes.
+        path: path of the file, used in messages.
 
     Raises:
         FileFormatError: it is not PLY, or cut short.
@@ -183,7 +183,7 @@ def _header(data: bytes, path: Path) -> tuple[str, list[_Element], int]:
         except (ValueError, KeyError, IndexError) as error:
             raise damage_error(path, f"its header has a line that is not PLY ('{line.strip()[:60]}')") from error
     if order is None:
-        raise damage_error(path, "its header does not say whether it is ascii or binary")
+        raise damage_error(path, "its header does not state whether it is ascii or binary")
     return order, elements, start
 
 
@@ -192,7 +192,7 @@ _Vertices: TypeAlias = tuple[FloatArray, ByteArray | None, BoolArray | None, Flo
 
 
 def _read_vertices(cursor: WordCursor, element: _Element, order: str) -> _Vertices:
-    """Return what is known of the vertices; a mask is whole numbers, and `position_std` finite lengths."""
+    """Return the properties of the vertices; a mask must consist of integers, and `position_std` of finite lengths."""
     names = [p.name for p in element.properties]
     if not set("xyz") <= set(names):
         raise damage_error(cursor.path, "its vertices have no x, y and z")
@@ -212,8 +212,8 @@ def _read_vertices(cursor: WordCursor, element: _Element, order: str) -> _Vertic
 
 
 def _colours(values: npt.NDArray[Any], kinds: set[str]) -> ByteArray | None:
-    """Return colours (V, 3), as the types of their properties say."""
-    # The type tells what white is, of dark scans too.
+    """Return colours (V, 3), scaled according to the types of their properties."""
+    # The type determines the value of white, also of dark scans.
     if kinds == {"u1"}:
         return values.astype(np.uint8) if ((values >= 0) & (values <= 255)).all() else None
     return bytes_of_colours(values)
@@ -235,7 +235,7 @@ def _ascii_columns(
     columns: dict[str, list[FloatArray]] = {name: [] for name in places}
     for part in cursor.words(element.count * width):
         for name, place in places.items():
-            # A part may begin and end anywhere in a row.
+            # A block of words may begin and end inside a row.
             columns[name].append(floats(part[(place - n_read) % width :: width], cursor.path))
         n_read += len(part)
     if n_read < element.count * width:
@@ -269,12 +269,12 @@ def _ascii_lists(
     except FileFormatError:
         raise
     except (ValueError, OverflowError) as error:
-        raise damage_error(cursor.path, f"a list has no whole number where one should be; {CUT_SHORT}") from error
+        raise damage_error(cursor.path, f"a list has text where an integer should be; {CUT_SHORT}") from error
     return np.array(sizes, dtype=np.int64), np.array(corners, dtype=np.int64)
 
 
 def _read_equal_lists(cursor: WordCursor, count: int) -> IndexArray | None:
-    """Return (count, n + 1) the sizes and corners of lists of equal length; None if their lengths differ."""
+    """Return the sizes and corners (count, n + 1) of lists of equal length; None if their lengths differ."""
     start = cursor.position
     first = cursor.word()
     size = int(ints([first], cursor.path)[0])
@@ -302,7 +302,7 @@ def _binary_lists(
     if element.count == 0:
         return none, none
     if any(p.count is not None and p.count[0] == "f" for p in element.properties):
-        raise damage_error(cursor.path, "a list has a length that is not a whole number, so export it again")
+        raise damage_error(cursor.path, "a list has a length that is not an integer, so export it again")
     uniform = _uniform_lists(cursor, element, order, list_index)
     if uniform is not None:
         return uniform
@@ -372,7 +372,7 @@ def _uniform_lists(
 
 
 def _indices(values: npt.NDArray[Any]) -> IndexArray:
-    """Return whole numbers of any scalar type as int64; other numbers become -1, which no mesh accepts."""
+    """Return integers of any scalar type as int64; other numbers become -1, which `Mesh` rejects."""
     if values.dtype.kind == "f":
         numbers = values.astype(np.float64)
         is_whole = np.isfinite(numbers) & (numbers == np.floor(numbers)) & (np.abs(numbers) < 2**53)
@@ -386,8 +386,8 @@ def write_ply(mesh: Mesh, comment: str = "") -> bytes:
     Colours and the mask of observed vertices are vertex properties of type uchar, `position_std` is a float.
 
     Args:
-        mesh: vertices in whatever unit they are in.
-        comment: one line for the header, ASCII; the mark of the frame follows it.
+        mesh: mesh to write, in any unit.
+        comment: one line of ASCII text for the header, before the line with the coordinate frame.
     """
     faces = mesh.faces
     lines = ["ply", "format binary_little_endian 1.0", *([f"comment {comment}"] if comment else [])]
@@ -416,7 +416,7 @@ def write_ply(mesh: Mesh, comment: str = "") -> bytes:
 
 
 def ply_comment(path: Path) -> str:
-    """Return the first comment in the header of a PLY file, empty where there is none or it cannot be read."""
+    """Return the first comment in the header of a PLY file, or an empty string without a comment or a readable file."""
     try:
         with path.open("rb") as stream:
             lines = stream.read(_FIRST_LINES).split(b"\n")

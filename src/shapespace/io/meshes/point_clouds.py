@@ -1,6 +1,6 @@
-"""Point clouds: PCD of the Point Cloud Library, text, binary and compressed by LZF, and rows of points in text.
+"""Point clouds: PCD of the Point Cloud Library (text, binary, or compressed by LZF), and text with rows of points.
 
-`.xyz` is of scanners and CloudCompare, `.pts` of Leica, with the number of points first.
+Scanners and CloudCompare write `.xyz`; Leica writes `.pts`, which begins with the number of points.
 
 After "The PCD (Point Cloud Data) file format", https://pointclouds.org/documentation/tutorials/pcd_file_format.html.
 """
@@ -32,20 +32,20 @@ _MOST_HEADER = 1 << 16  # bytes (64 KiB)
 _MOST_COUNT = 1 << 14  # values of one field in a point; limit on damaged files
 _KINDS = {"I": "i", "U": "u", "F": "f"}
 _SIZES = ("1", "2", "4", "8")
-_COMMENTS = (b"#", b"//", b"%")  # of rows of points
+_COMMENTS = (b"#", b"//", b"%")  # in text with rows of points
 _LITERAL = 32  # LZF: control bytes below it are followed by literals
 _LONG = 7  # LZF: this length is continued in the next byte
 
 
 def read_pcd(data: bytes, path: Path) -> Mesh:
-    """Read the points of a PCD file; those that are NaN, which an organised cloud has for nothing seen, are left out.
+    """Read the points of a PCD file, except NaN points, which are unobserved pixels of organised clouds.
 
     Args:
-        data: the whole file.
-        path: its name, for messages and the mesh's name.
+        data: complete content of the file.
+        path: path of the file, used in messages and as the name of the mesh.
 
     Raises:
-        FileFormatError: it is no PCD, has no x, y and z, or is cut short.
+        FileFormatError: it is not PCD, has no x, y and z, or is cut short.
     """
     head, data_start = _header(plain_text(data), path)
     data = plain_text(data)
@@ -63,12 +63,12 @@ def read_pcd(data: bytes, path: Path) -> Mesh:
         raise damage_error(path, f"its data are '{kind[:40]}', but only ascii, binary and binary_compressed are read")
     is_measured = ~np.isnan(points).any(axis=1)
     if not is_measured.any():
-        raise damage_error(path, "none of its points is there")
+        raise damage_error(path, "all its points are missing")
     return mesh_of(points[is_measured], None, path)
 
 
 def _header(data: bytes, path: Path) -> tuple[dict[str, list[str]], int]:
-    """Return the words of each line of the header by the first, and where the data begin."""
+    """Return the words of each header line by its first word, and the index of the first byte of the data."""
     fields: dict[str, list[str]] = {}
     offset = 0
     while "DATA" not in fields:
@@ -80,31 +80,31 @@ def _header(data: bytes, path: Path) -> tuple[dict[str, list[str]], int]:
         if words and not words[0].startswith("#"):
             fields[words[0].upper()] = words[1:]
     if not fields["DATA"]:
-        raise damage_error(path, "its header does not say how the data are written")
+        raise damage_error(path, "its header does not state the format of the data")
     return fields, offset
 
 
 def _row(head: dict[str, list[str]], path: Path) -> tuple[np.dtype[np.void], int]:
-    """Return what one point is in the file, with x, y and z by name, and how many points there are."""
+    """Return the record type of a point, with fields x, y and z, and the number of points."""
     names = head.get("FIELDS", head.get("COLUMNS", []))
     sizes, kinds = head.get("SIZE", []), head.get("TYPE", [])
     counts = head.get("COUNT", ["1"] * len(names))
     if not {"x", "y", "z"} <= set(names) or not len(names) == len(sizes) == len(kinds) == len(counts):
-        raise damage_error(path, "its header does not say where x, y and z are; save it again")
+        raise damage_error(path, "its header does not define x, y and z; save it again")
     if any(names.count(axis) != 1 or counts[names.index(axis)] != "1" for axis in "xyz"):
         raise damage_error(path, "its header has x, y or z more than once; save it again")
     fields: list[tuple[str, str, tuple[int, ...]]] = []
     for number, (name, size, kind, count) in enumerate(zip(names, sizes, kinds, counts, strict=True)):
         if size not in _SIZES or kind not in _KINDS or (kind, size) == ("F", "1") or not count.isdecimal():
-            raise damage_error(path, f"its field '{name[:40]}' is of a type that is not known; save it again")
+            raise damage_error(path, f"its field '{name[:40]}' has an unknown type; save it again")
         if len(count) > 5 or int(count) > _MOST_COUNT:
-            raise damage_error(path, f"its field '{name[:40]}' has {count[:20]} numbers a point, far too many")
+            raise damage_error(path, f"its field '{name[:40]}' has {count[:20]} numbers per point, too many")
         fields.append((name if name in "xyz" else f"{name}/{number}", f"<{_KINDS[kind]}{size}", (int(count),)))
     plain = [(name, kind, shape if shape != (1,) else ()) for name, kind, shape in fields]
     try:
         n = int(head["POINTS"][0]) if "POINTS" in head else int(head["WIDTH"][0]) * int(head["HEIGHT"][0])
     except (KeyError, IndexError, ValueError) as error:
-        raise damage_error(path, "its header does not say how many points there are; save it again") from error
+        raise damage_error(path, "its header does not state the number of points; save it again") from error
     return np.dtype(plain), n
 
 
@@ -129,11 +129,11 @@ def _text(text: bytes, head: dict[str, list[str]], n: int, path: Path) -> FloatA
 
 
 def _unpack_columns(data: bytes, offset: int, row: np.dtype[np.void], n: int, path: Path) -> FloatArray:
-    """Return the points of compressed data, which stores field after field for all points."""
+    """Return the points of compressed data, in which each field is stored for all points before the next field."""
     sizes = np.frombuffer(data[offset : offset + 8].ljust(8, b"\0"), "<u4")
     packed, size = int(sizes[0]), int(sizes[1])
     if n < 0 or size != n * row.itemsize or offset + 8 + packed > len(data):
-        raise damage_error(path, f"its packed data have another length than its header says; {CUT_SHORT}")
+        raise damage_error(path, f"its compressed data do not have the length that its header declares; {CUT_SHORT}")
     Allowance(len(data), path).take(size, 1)
     content = _lzf(data[offset + 8 : offset + 8 + packed], size, path)
     offsets = {name: n * int(field[1]) for name, field in (row.fields or {}).items()}
@@ -142,7 +142,7 @@ def _unpack_columns(data: bytes, offset: int, row: np.dtype[np.void], n: int, pa
 
 
 def _lzf(data: bytes, size: int, path: Path) -> bytes:
-    """Return the `size` bytes that LZF made of `data`: runs as they are, and copies of what came before."""
+    """Return the `size` bytes that LZF `data` unpack to: literal runs, and copies of earlier output."""
     out = bytearray()
     position = 0
     try:
@@ -163,30 +163,30 @@ def _lzf(data: bytes, size: int, path: Path) -> bytes:
                 raise IndexError
             length += 2
             run = bytes(out[copy_start : copy_start + length])
-            # What is copied may go on into the copy.
+            # A copy may overlap its own output.
             out += (run * (length // len(run) + 1))[:length]
     except IndexError as error:
-        raise damage_error(path, f"its packed data are wrong; {CUT_SHORT}") from error
+        raise damage_error(path, f"its compressed data are damaged; {CUT_SHORT}") from error
     if len(out) != size:
-        raise damage_error(path, f"its packed data have another length than its header says; {CUT_SHORT}")
+        raise damage_error(path, f"its compressed data do not have the length that its header declares; {CUT_SHORT}")
     return bytes(out)
 
 
 def read_xyz(data: bytes, path: Path) -> Mesh:
     """Read rows whose first three numbers are a point; intensity, colour and normals are ignored.
 
-    A row of one number says how many points follow it. A first line of words is the names of columns, and `#`, `//` and
-    `%` begin comments; commas, semicolons and white space separate numbers, which may have decimal commas.
+    A row of one number is the number of points that follow. A first line of words contains column names, and `#`, `//`
+    and `%` begin comments; commas, semicolons and white space separate numbers, which may have decimal commas.
 
     Args:
-        data: the whole file.
-        path: its name, for messages and the mesh's name.
+        data: complete content of the file.
+        path: path of the file, used in messages and as the name of the mesh.
 
     Raises:
-        FileFormatError: it is binary or no table of numbers, rows differ in their columns, or points are missing.
+        FileFormatError: it is binary or not a table of numbers, rows differ in their columns, or points are missing.
     """
     if b"\0" in data[:65536]:
-        raise damage_error(path, "it is binary; of this ending only text with rows of x y z is read")
+        raise damage_error(path, "it is binary; files with this ending are read only as text with rows of x y z")
     parts: list[FloatArray] = []
     width = lines_before = declared = 0
     for lines in line_blocks(numeric_text(data, path, commas_separate=True)):
@@ -199,9 +199,9 @@ def read_xyz(data: bytes, path: Path) -> Mesh:
         if points:
             width = width or len(points[0])
             if any(len(row) != width for row in points) or width < 3:
-                raise damage_error(path, f"it is no table of points with three or more columns, {width} in each row")
+                raise damage_error(path, f"it is not a table of points with three or more columns, {width} in each row")
             if not all(map(is_number, points[0])) and not lines_before:
-                raise damage_error(path, "it has words beside its points (a molecule perhaps), so it is no scan")
+                raise damage_error(path, "it has words next to its points (a molecule perhaps), so it is not a scan")
             coordinates = chain.from_iterable(row[:3] for row in points)
             parts.append(floats(coordinates, path).reshape(-1, 3))
             lines_before += len(points)

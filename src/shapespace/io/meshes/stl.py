@@ -25,24 +25,24 @@ from shapespace.io.parsing import (
 from shapespace.types import FloatArray, Mesh
 
 _ROW = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-# A few corners closer than float32 can tell are noise; with more, the surface that is read is another one.
+# Share of vertices that may merge because float32 cannot distinguish them; with more, the surface would change.
 _MOST_MERGED = 0.01
-_HEADER, _FIRST_LINE = 80, 512  # bytes; of binary STL, and those that hold the first line of text
+_HEADER, _FIRST_LINE = 80, 512  # bytes: header of binary STL; bytes that contain the first line of text
 
 
 def read_stl(data: bytes, path: Path) -> Mesh:
     """Read STL; corners that are exactly equal become one vertex, numbered in the order of first appearance.
 
     Args:
-        data: the whole file.
-        path: its name, for messages and the mesh's name.
+        data: complete content of the file.
+        path: path of the file, used in messages and as the name of the mesh.
 
     Raises:
-        FileFormatError: it is not STL, holds no triangles, or is cut short.
+        FileFormatError: it is not STL, contains no triangles, or is cut short.
     """
     declared = int.from_bytes(data[80:84], "little") if len(data) >= 84 else -1
-    # Many binary files start with "solid" too, so the length decides: text, taken for a number, declares thousands of
-    # millions of triangles.
+    # Many binary files start with "solid" too, so the length decides: text interpreted as a number declares billions of
+    # triangles.
     if declared >= 0 and len(data) >= 84 + 50 * declared:
         binary = True
     else:
@@ -57,14 +57,14 @@ def read_stl(data: bytes, path: Path) -> Mesh:
         table = np.frombuffer(data, dtype=_ROW, count=declared, offset=84)
         corners = table["corners"].reshape(-1, 3).astype(np.float64)
     if not len(corners):
-        raise damage_error(path, "it holds no triangles")
+        raise damage_error(path, "it contains no triangles")
     vertices, index = merge_equal(corners)
     header = data[: _HEADER if binary else _FIRST_LINE]
     return mesh_of(vertices, index.reshape(-1, 3), path, header=header)
 
 
 def probe_stl(head: bytes, size: int, path: Path) -> None:
-    """Check that a binary STL file is as long as its header declares; arguments and errors as of `probe_ply`."""
+    """Check that a binary STL file is as long as its header declares; see `probe_ply` for arguments and errors."""
     if head.lstrip()[:5].lower() != b"solid":
         declared = int.from_bytes(head[80:84], "little") if len(head) >= 84 else 1
         check_count(declared, 50, size - 84, "triangles", path)
@@ -80,11 +80,11 @@ def _ascii_corners(data: bytes, path: Path) -> FloatArray:
         facets += sum(split[0] == b"facet" for split in words)
         last = words[-1][0] if words else last
         if any(len(split) != 4 for split in rows):
-            raise damage_error(path, f"a corner has not three numbers; {CUT_SHORT}")
+            raise damage_error(path, f"a corner does not have three numbers; {CUT_SHORT}")
         corners.append(floats(chain.from_iterable(split[1:] for split in rows), path).reshape(-1, 3))
         count += len(rows)
     if last != b"endsolid" or count != 3 * facets:
-        raise damage_error(path, f"it holds {count} corners for {facets} triangles, or has no end; {CUT_SHORT}")
+        raise damage_error(path, f"it has {count} corners for {facets} triangles, or has no end; {CUT_SHORT}")
     return join_parts(corners, np.float64, 3)
 
 
@@ -92,7 +92,7 @@ def merge_equal(points: FloatArray) -> tuple[FloatArray, IndexArray]:
     """Merge exactly equal rows of `points` (N, 3).
 
     Returns:
-        (M, 3) the different rows in the order of first appearance, and (N,) which of them each row is.
+        The distinct rows (M, 3) in the order of first appearance, and the index (N,) of each row among them.
     """
     points = points + 0.0  # -0.0 equals 0.0
     bits: npt.NDArray[np.uint64] = np.ascontiguousarray(points).view(np.uint64)
@@ -100,7 +100,7 @@ def merge_equal(points: FloatArray) -> tuple[FloatArray, IndexArray]:
     ranked = bits[order]
     new = np.ones(len(points), dtype=np.bool_)
     new[1:] = (ranked[1:] != ranked[:-1]).any(axis=1)
-    # lexsort is stable, so the first of each group is the one that appears first.
+    # lexsort is stable, so the first row of each group is the first in `points`.
     first = order[new]
     by_appearance = np.argsort(first)
     rank = np.empty(len(first), dtype=np.int64)
@@ -111,14 +111,14 @@ def merge_equal(points: FloatArray) -> tuple[FloatArray, IndexArray]:
 
 
 def write_stl(mesh: Mesh) -> bytes:
-    """Return `mesh` as binary STL: float32, its triangles only, without their numbering of vertices.
+    """Return `mesh` as binary STL: triangles in float32, without vertex numbers.
 
     Raises:
-        InputError: it has no triangles, coordinates too large for float32, or so far from the origin that float32
-            would make one of more than 1 % of its vertices.
+        InputError: it has no triangles, coordinates too large for float32, or is so far from the origin that
+            float32 would merge more than 1 % of its vertices.
     """
     if mesh.faces is None:
-        raise InputError(f"{mesh.name} has no triangles, and STL holds nothing else; write it as PLY instead.")
+        raise InputError(f"{mesh.name} has no triangles, and STL stores only triangles; write it as PLY instead.")
     corners = mesh.vertices[mesh.faces]
     if (np.abs(corners) > np.finfo(np.float32).max).any():
         raise InputError(f"{mesh.name} has coordinates too large for STL; write it as PLY instead.")

@@ -1,6 +1,6 @@
-"""Textures of surfaces, sampled to vertex colours; read by Pillow, of the extra `report`.
+"""Textures of surfaces, sampled to vertex colours; read with Pillow from the extra `report`.
 
-What cannot be read leaves a surface without colours and says so in a note: a fit needs the shape alone.
+If a texture cannot be read, the surface has no colours, and a note gives the reason: a fit needs only the shape.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from shapespace.io.files import read_bytes
 from shapespace.types import ByteArray, FloatArray
 
 LARGEST_FILE_BYTES = 2**28
-"""Pictures in longer files are not read (256 MiB)."""
+"""Largest size of the file of a picture (256 MiB)."""
 
 MOST_PIXELS = 2**26
-"""Pictures with more are not unpacked (8192 times 8192)."""
+"""Largest number of pixels of a picture (8192 x 8192)."""
 
 MOST_PIXELS_IN_ALL = 2**28
-"""All pictures of one surface have no more than these."""
+"""Largest number of pixels of all pictures of a surface."""
 
 MOST_BYTES_IN_ALL = 2**29
-"""Limit of the bytes of all files of materials and pictures of one surface (512 MiB)."""
+"""Largest total size of the files of materials and pictures of a surface (512 MiB)."""
 
 MOST_NAMES = 2**14
-"""Limit of the files of materials and pictures that a surface names; finding one takes some 40 microseconds."""
+"""Largest number of files of materials and pictures that a surface names; a lookup takes about 40 microseconds."""
 
-_SIDE = 2048  # pixels; a texture is sampled at vertices, so finer ones cost memory only
+_SIDE = 2048  # pixels; textures are sampled at vertices, so a higher resolution only costs memory
 _KINDS = ("JPEG", "PNG", "BMP", "TIFF")
 
 
@@ -43,7 +43,7 @@ class CompanionFiles:
     """Materials and textures in the folder of a surface or below it, at most `MOST_BYTES_IN_ALL` together.
 
     Args:
-        path: of the surface.
+        path: path of the file of the surface.
     """
 
     def __init__(self, path: Path) -> None:
@@ -55,21 +55,21 @@ class CompanionFiles:
         """Return the resolved path of the file called `name`, so that two spellings of one file are recognised.
 
         Args:
-            name: as the surface's file has it.
-            file_kind: the file is, for messages.
+            name: name of the file, as in the file of the surface.
+            file_kind: description of the file, used in messages.
 
         Raises:
-            TextureError: it lies elsewhere or does not exist, or the surface names too many files.
+            TextureError: it is in another folder or does not exist, or the surface names too many files.
         """
         if name in self._found:
             return self._found[name]
         if len(self._found) >= MOST_NAMES:
             raise TextureError(f"it names more than {MOST_NAMES:,} files of materials and pictures")
-        short = _short(name)
+        short = _printable_name(name)
         try:
             target = (self._folder / PurePosixPath(name.replace("\\", "/"))).resolve()
             if "://" in name or not target.is_relative_to(self._folder):
-                raise TextureError(f"{file_kind} '{short}' is outside its folder, where nothing is read")
+                raise TextureError(f"{file_kind} '{short}' is outside its folder, and is not read")
             if not target.is_file():
                 raise TextureError(f"{file_kind} '{short}' is not in its folder")
         except (OSError, ValueError, RuntimeError) as error:
@@ -81,17 +81,17 @@ class CompanionFiles:
         """Return the content of a file that `find` returned.
 
         Args:
-            file: its resolved path.
-            file_kind: the file is, for messages.
-            at_most: bytes; a longer file is not read.
+            file: resolved path of the file.
+            file_kind: description of the file, used in messages.
+            at_most: largest allowed size of the file, bytes.
 
         Raises:
-            TextureError: it cannot be read or is too long, alone or together with those read before it.
+            TextureError: it cannot be read, is too long, or exceeds the total limit with the files read before.
         """
         try:
             content = read_bytes(file, min(at_most, self._bytes))
         except (ShapespaceError, OSError) as error:
-            raise TextureError(f"{file_kind} '{_short(file.name)}' cannot be read") from error
+            raise TextureError(f"{file_kind} '{_printable_name(file.name)}' cannot be read") from error
         self._bytes -= len(content)
         return content
 
@@ -104,21 +104,22 @@ class Pictures:
         self._pixels = MOST_PIXELS_IN_ALL
 
     def sampled(self, name: str, content: Callable[[], bytes], uv: FloatArray, key: str = "") -> ByteArray:
-        """Return the colours (N, 3) of a picture at `uv`, between its pixels linearly.
+        """Return the colours (N, 3) of a picture at `uv`, interpolated linearly between its pixels.
 
         Args:
-            name: of the picture, for messages.
-            content: gives the bytes of its JPEG, PNG, BMP or TIFF file.
-            uv: (N, 2) from the lower left corner (0, 0) to the upper right (1, 1); beyond these it repeats.
-            key: by which the picture is recognised, such as its resolved path; empty for its name.
+            name: name of the picture, used in messages.
+            content: function that returns the bytes of the JPEG, PNG, BMP or TIFF file.
+            uv: (N, 2) texture coordinates from the lower left corner (0, 0) to the upper right (1, 1); the picture is
+                repeated beyond this range.
+            key: key of the picture in the cache, such as its resolved path; empty for its name.
 
         Raises:
-            TextureError: no Pillow, or the picture cannot be had, is damaged, of another kind or too large.
+            TextureError: Pillow is not installed, or the picture cannot be read, is damaged, unsupported or too large.
         """
         known = key or name
         if known not in self._unpacked:
             try:
-                self._unpacked[known] = self._unpack(content(), _short(name))
+                self._unpacked[known] = self._unpack(content(), _printable_name(name))
             except TextureError as reason:
                 self._unpacked[known] = reason
         picture = self._unpacked[known]
@@ -130,9 +131,7 @@ class Pictures:
         try:
             from PIL import Image
         except ImportError as error:
-            raise TextureError(
-                f"its picture '{name}' is read with Pillow, which pip install 'shapespace[report]' adds"
-            ) from error
+            raise TextureError(f"its picture '{name}' needs Pillow; run pip install 'shapespace[report]'") from error
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
@@ -141,25 +140,25 @@ class Pictures:
                 if count > min(MOST_PIXELS, self._pixels):
                     raise TextureError(f"its picture '{name}' has {image.width} times {image.height} pixels, too many")
                 self._pixels -= count
-                # Of a JPEG only as much is unpacked as is needed.
+                # A JPEG is decoded only at the resolution that is needed.
                 image.draft("RGB", (_SIDE, _SIDE))
                 image.thumbnail((_SIDE, _SIDE))
                 return np.asarray(image.convert("RGB"))
         except TextureError:
             raise
-        except Exception as error:  # a damaged picture may raise anything at all
-            raise TextureError(f"its picture '{name}' is damaged or of a kind that is not read") from error
+        except Exception as error:  # a damaged picture may raise any exception
+            raise TextureError(f"its picture '{name}' is damaged or has an unsupported format") from error
 
 
-def _short(name: str) -> str:
-    """Return a name out of a file as a terminal may show it."""
+def _printable_name(name: str) -> str:
+    """Return a name from a file, shortened and safe to print in a terminal."""
     return "".join(letter if letter.isprintable() else "?" for letter in name[:80])
 
 
 def _interpolate(pixels: ByteArray, uv: FloatArray) -> ByteArray:
     height, width = pixels.shape[:2]
     known = np.where(np.isfinite(uv), uv, 0.0)
-    # 1 is the last pixel and not the first one again.
+    # A coordinate of exactly 1 is the last pixel, not the first pixel of the next repetition.
     inside = np.where((known >= 0.0) & (known <= 1.0), known, known - np.floor(known))
     x = np.clip(inside[:, 0] * width - 0.5, 0.0, width - 1.0)
     y = np.clip((1.0 - inside[:, 1]) * height - 0.5, 0.0, height - 1.0)

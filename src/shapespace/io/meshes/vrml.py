@@ -1,7 +1,7 @@
 """VRML 1 and 2 (`.wrl`): points and faces of IndexedFaceSets; textures, normals and colours are ignored.
 
-Written from ISO/IEC 14772-1:1997 (VRML 2) and "VRML 1.0 Specification" (1995). BU-3DFE stores its scans as VRML 2: one
-Shape with `coord Coordinate { point [ ... ] }`, `coordIndex [ a, b, c, -1, ... ]`, and texture parts that are skipped.
+Implemented after ISO/IEC 14772-1:1997 (VRML 2) and "VRML 1.0 Specification" (1995). BU-3DFE stores its scans as VRML 2:
+one Shape with `coord Coordinate { point [ ... ] }`, `coordIndex [ a, b, c, -1, ... ]`, and textures, which are skipped.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from shapespace.io.parsing import (
 from shapespace.io.read_limits import Allowance
 from shapespace.types import FloatArray, Mesh
 
-# A string without an end swallows the rest, so that no position is scanned twice.
+# A string without an end extends to the end of the file, so that no position is scanned twice.
 _SKIPPED = re.compile(rb'(?:(?:"(?:[^"\\]|\\.)*+(?:"|\\?\Z)|#[^\r\n]*)[\s,]*+)++', re.DOTALL)
 _TO_BRACKET = re.compile(rb"[^{}\[\]]*+")
 _HEXADECIMAL = re.compile(rb"(?<!\S)0[xX][0-9a-fA-F]{1,16}(?!\S)")
@@ -41,10 +41,10 @@ _FIELDS = {b"translation": 3, b"rotation": 4, b"scale": 3, b"scaleFactor": 3, b"
 _KNOWN = {b"USE", b"ccw", b"vertexOrdering", *_FIELDS}
 
 
-def _with_points(text: bytes, path: Path) -> bytes:
+def _replace_decimal_commas(text: bytes, path: Path) -> bytes:
     """Return the coordinates of points with decimal points.
 
-    Commas separate numbers in VRML. Those between points alone are in fewer than half of the words between white space.
+    Commas separate numbers in VRML. If they only separate points, fewer than half of the words contain a comma.
     """
     if _TIGHT_COMMA.search(text):
         spaced = _LAST_COMMA.sub(b" ", text)
@@ -73,8 +73,8 @@ class _Node:
 class _Scene:
     """State of the parser: blocks of points, triangles with the block of their points, and frames.
 
-    A frame is what a Transform moves: the frame outside of it, and its (3, 4) matrix, which is only known where the
-    Transform ends. Frame 0 is the file's own.
+    A frame is the coordinate frame of a Transform: the index of its outer frame, and its (3, 4) matrix, which is only
+    known at the end of the Transform. Frame 0 is that of the file.
     """
 
     path: Path
@@ -104,7 +104,7 @@ class _Scene:
 
     @property
     def frame(self) -> int:
-        """Where one stands."""
+        """Return the index of the current frame."""
         return self.stack[-1].frame if self.stack else 0
 
     def words(self, words: list[bytes]) -> None:
@@ -135,14 +135,14 @@ class _Scene:
         elif name in self.named_shapes:
             printable_name = name[:60].decode("ascii", "replace")
             raise damage_error(
-                self.path, f"it shows the shape '{printable_name}' twice (USE), so export it again as plain triangles"
+                self.path, f"it uses the shape '{printable_name}' twice (USE), so export it again as plain triangles"
             )
 
     def numbers(self, name: bytes, text: bytes) -> None:
-        """Take a list that holds no nodes."""
+        """Process a list of numbers."""
         node = self.stack[-1] if self.stack else _Node(b"")
         if name == b"point" and node.kind in _POINTS:
-            points = floats_of(_with_points(text, self.path).replace(b",", b" "), self.path)
+            points = floats_of(_replace_decimal_commas(text, self.path).replace(b",", b" "), self.path)
             if len(points) % 3:
                 raise damage_error(self.path, f"its points have {len(points)} numbers, not three each; {CUT_SHORT}")
             self.blocks.append((points.reshape(-1, 3), node.frame))
@@ -198,8 +198,10 @@ class _Scene:
         """Apply a Transform to its children: T C R SR S -SR -C, section 6.52 of the standard."""
         values = node.numbers
         zero, none = np.zeros(3), np.array([0.0, 0.0, 1.0, 0.0])
-        orientation = _turn(values.get(b"scaleOrientation", none))
-        linear = _turn(values.get(b"rotation", none)) @ orientation * values.get(b"scale", np.ones(3)) @ orientation.T
+        orientation = _rotation(values.get(b"scaleOrientation", none))
+        linear = (
+            _rotation(values.get(b"rotation", none)) @ orientation * values.get(b"scale", np.ones(3)) @ orientation.T
+        )
         center = values.get(b"center", zero)
         if (linear == np.eye(3)).all() and not values.get(b"translation", zero).any():
             return
@@ -211,13 +213,15 @@ class _Scene:
         shift = values.get(b"translation", zero) + center - linear @ center
         self.frames[node.frame] = (self.frames[node.frame][0], np.column_stack([linear, shift]))
 
-    def placed(self) -> tuple[FloatArray, IndexArray | None]:
-        """Return all points in the file's own frame, and the triangles; those that are mirrored are turned."""
+    def joined_points(self) -> tuple[FloatArray, IndexArray | None]:
+        """Return all points in the frame of the file, and the triangles; mirrored triangles are flipped."""
         matrices = self.frames[:1]
         for outer, inner in self.frames[1:]:
-            # An outer frame stands before those in it, so it is in the file's own frame already.
-            of_outer = matrices[outer][1]
-            matrices.append((outer, of_outer[:, :3] @ inner + np.column_stack([np.zeros((3, 3)), of_outer[:, 3]])))
+            # An outer frame precedes its inner frames, so its matrix already refers to the frame of the file.
+            outer_matrix = matrices[outer][1]
+            matrices.append(
+                (outer, outer_matrix[:, :3] @ inner + np.column_stack([np.zeros((3, 3)), outer_matrix[:, 3]]))
+            )
         points = [
             vertices if not k else vertices @ matrices[k][1][:, :3].T + matrices[k][1][:, 3]
             for vertices, k in self.blocks
@@ -228,7 +232,7 @@ class _Scene:
         return np.concatenate(points), np.concatenate(faces) if faces else None
 
 
-def _turn(axis_angle: FloatArray) -> FloatArray:
+def _rotation(axis_angle: FloatArray) -> FloatArray:
     """Return the (3, 3) rotation about an axis of any length by an angle in radians (Rodrigues)."""
     length = float(np.linalg.norm(axis_angle[:3]))
     if length == 0 or axis_angle[3] == 0:
@@ -241,27 +245,27 @@ def _turn(axis_angle: FloatArray) -> FloatArray:
 def _corners(text: bytes, path: Path) -> IndexArray:
     text = text.replace(b",", b" ")
     if b"x" in text or b"X" in text:
-        # VRML allows hexadecimal whole numbers.
+        # VRML allows hexadecimal integers.
         text = _HEXADECIMAL.sub(lambda match: b"%d" % int(match[0], 16), text)
     index = ints_of(text, path)
     if len(index) and index.min() < -1:
         raise damage_error(path, f"a face points at vertex {int(index.min())}; {CUT_SHORT}")
-    # The last face may do without its end.
+    # The last face may lack its end marker.
     return np.append(index, -1) if len(index) and index[-1] != -1 else index
 
 
 def read_vrml(data: bytes, path: Path) -> Mesh:
-    """Read VRML: all points in the file's order, those of several shapes one after another, and polygons as fans.
+    """Read VRML: the points of all shapes in the order of the file, and polygons as fans.
 
-    A Transform of VRML 2 moves what stands in it, and a mirroring one keeps the outside outside; `ccw FALSE` turns the
-    faces. Points without an IndexedFaceSet become a point cloud.
+    A Transform of VRML 2 is applied to its children, and a mirroring one also flips the triangles, so that normals stay
+    outward; `ccw FALSE` flips the faces. Points without an IndexedFaceSet become a point cloud.
 
     Args:
-        data: the whole file.
-        path: its name, for messages and the mesh's name.
+        data: complete content of the file.
+        path: path of the file, used in messages and as the name of the mesh.
 
     Raises:
-        FileFormatError: it holds no points, is cut short, has too many nodes (`io.limits`), shows a shape twice
+        FileFormatError: it contains no points, is cut short, has too many nodes (`io.read_limits`), uses a shape twice
             (`USE`), or moves shapes by nodes of VRML 1.
         MeshError: faces that point past the end of their points.
     """
@@ -301,15 +305,15 @@ def read_vrml(data: bytes, path: Path) -> Mesh:
     if scene.stack:
         raise damage_error(path, f"{len(scene.stack)} of its nodes have no end; {CUT_SHORT}")
     if not sum(len(points) for points, _ in scene.blocks):
-        raise damage_error(path, "it holds no points of an IndexedFaceSet, so it is not VRML or holds other shapes")
+        raise damage_error(path, "it has no points of an IndexedFaceSet, so it is not VRML or contains other shapes")
     if scene.shared and scene.moved:
         raise damage_error(
             path, "shapes that are moved share their points (USE), so export it again as plain triangles"
         )
-    return mesh_of(*scene.placed(), path)
+    return mesh_of(*scene.joined_points(), path)
 
 
 def _to_bracket(text: bytes, offset: int) -> int:
-    """Return where the next bracket is, or the end."""
+    """Return the index of the next bracket, or of the end."""
     match = _TO_BRACKET.match(text, offset)
     return match.end() if match else len(text)

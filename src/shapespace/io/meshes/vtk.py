@@ -51,33 +51,33 @@ _XML = {
     "Int8": "i1", "UInt8": "u1", "Int16": "i2", "UInt16": "u2", "Int32": "i4", "UInt32": "u4",
     "Int64": "i8", "UInt64": "u8", "Float32": "f4", "Float64": "f8", "String": "u1",
 }  # fmt: skip
-# Fields may hold these too, which no surface needs, so they are passed over.
+# Fields may contain these types too, which no surface needs, so they are skipped.
 _TEXTS = ("string", "utf8_string")
 _LINES = ("variant",)
 _BITS = ("bit",)
 _OFFSETS = re.compile(rb"\s*OFFSETS\s")
 _BLANK_LINE = re.compile(rb"\n[ \t\r]*\n")
-# zlib cannot shrink by more than this (1032 : 1), so a header that promises more lies.
+# zlib compresses by a factor of at most 1032, so a header that declares more is wrong.
 _MAX_INFLATION = 1040
 _COLOUR_WIDTHS = (3, 4)  # RGB and RGBA
 _MOST_ATTRIBUTES = 100  # arrays searched for colours; limit on damaged files
 
 LINE_NOTE = (
-    "Its lines are no part of a surface, and their points alone are read; shapespace align reads them as curves."
+    "Its lines are not part of a surface, and only their points are read; shapespace align reads them as curves."
 )
 
 Values = npt.NDArray[Any]
 Cells: TypeAlias = tuple[IndexArray, IndexArray]
-"""Numbers of corners of cells, and their corners one after another."""
+"""Number of corners of each cell, and the corners of all cells one after another."""
 
 
 class _Cursor(WordCursor):
     """Read position in a legacy file, whose words are text and whose numbers are text or binary.
 
     Args:
-        data: the file after its header.
-        path: for messages.
-        is_text: whether numbers are text.
+        data: content of the file after its header.
+        path: path of the file, used in messages.
+        is_text: whether numbers are text; False for binary numbers.
     """
 
     def __init__(self, data: bytes, path: Path, is_text: bool) -> None:
@@ -106,7 +106,7 @@ class _Cursor(WordCursor):
             return
         check_count(count, 1, len(self.data) - self.position, "pieces of text", self.path)
         for _ in range(count):
-            # The two highest bits of the length tell how many bytes it has.
+            # The two highest bits of the length encode its number of bytes.
             width = 8 >> (self.data[self.position] >> 6) if self.position < len(self.data) else 1
             prefix = self.data[self.position : self.position + width]
             length = int.from_bytes(prefix, "big") & ((1 << (8 * width - 2)) - 1)
@@ -136,13 +136,13 @@ class _Cursor(WordCursor):
 
     def skip_if_offsets(self) -> bool:
         """Move past the word OFFSETS if it comes next, and return whether it did."""
-        # As a number, 'OFFS' would be a polygon of a thousand million corners.
+        # As a number, 'OFFS' would be the size of a polygon with a billion corners.
         match = _OFFSETS.match(self.data, self.position)
         self.position = match.end() if match else self.position
         return match is not None
 
     def count(self) -> int:
-        """Return the next word as a whole number."""
+        """Return the next word as an integer."""
         return int(ints([self.word()], self.path)[0])
 
     def kind(self) -> str:
@@ -155,15 +155,15 @@ class _Cursor(WordCursor):
 
 
 def read_vtk(data: bytes, path: Path) -> Mesh:
-    """Read VTK poly data, legacy or XML, as the content shows: both endings are used for both formats.
+    """Read VTK poly data, legacy or XML, as the content indicates, since both endings are used for both formats.
 
-    Polygons become fans and triangle strips triangles; vertex and line cells are passed over, the latter with a note.
+    Polygons become fans and triangle strips triangles; vertex and line cells are skipped, line cells with a note.
     Legacy files are ascii or binary, with the cells of VTK before or after 5.1; arrays of XML are ascii, inline base64
     or appended, plain or packed by zlib, and pieces are joined.
 
     Args:
-        data: the whole file.
-        path: its name, for messages and the mesh's name.
+        data: complete content of the file.
+        path: path of the file, used in messages and as the name of the mesh.
 
     Raises:
         FileFormatError: it is not VTK poly data, is cut short, or is compressed otherwise than by zlib.
@@ -173,9 +173,9 @@ def read_vtk(data: bytes, path: Path) -> Mesh:
 
 
 def read_vtk_lines(data: bytes, path: Path) -> tuple[Mesh, list[tuple[list[int], bool]]]:
-    """Read VTK poly data and the polylines of its lines: numbers of vertices along them, and whether they are closed.
+    """Read VTK poly data and its polylines: the indices of vertices along each, and whether it is closed.
 
-    Lines that meet at a point, where no third one is, are one polyline. Errors are those of `read_vtk`.
+    Lines that meet at a point without a third line form one polyline. Errors are those of `read_vtk`.
     """
     mesh, given = _read(data, path)
     corners = join_parts([corners for _, corners in given], np.int64)
@@ -224,7 +224,7 @@ def _read_legacy(data: bytes, path: Path) -> tuple[Mesh, list[Cells]]:
     body = data[sum(len(line) + 1 for line in head[:3]) :]
     allowance = Allowance(len(data), path)
     if encoding not in (b"ASCII", b"BINARY"):
-        raise damage_error(path, "its third line says neither ASCII nor BINARY")
+        raise damage_error(path, "its third line is neither ASCII nor BINARY")
     is_text, start = encoding == b"ASCII", len(data) - len(body)
     cursor = _Cursor(numeric_text(data, path, start)[start:] if is_text else body, path, is_text)
     dataset = cursor.word() + b" " + cursor.word()
@@ -268,7 +268,7 @@ def _read_legacy(data: bytes, path: Path) -> tuple[Mesh, list[Cells]]:
 
 
 def _legacy_colours(cursor: _Cursor, vertices: int) -> ByteArray | None:
-    """Return the first colours among what is known of the points; what comes after the surface is not judged."""
+    """Return the first colours among the point data; errors in these sections are ignored."""
     try:
         if cursor.count() != vertices:
             return None
@@ -348,7 +348,7 @@ def _legacy_cells(cursor: _Cursor, path: Path) -> Cells:
         if cursor.word() != b"CONNECTIVITY":
             raise damage_error(path, f"its cells have OFFSETS without CONNECTIVITY; {CUT_SHORT}")
         corners = cursor.array(second, cursor.kind()).astype(np.int64)
-        return _from_offsets(offsets, corners, path)
+        return _cells_from_offsets(offsets, corners, path)
     packed = cursor.array(second, "i4").astype(np.int64)
     if first > 0 and second and second % first == 0:
         table = packed.reshape(first, -1)
@@ -367,7 +367,7 @@ def _legacy_cells(cursor: _Cursor, path: Path) -> Cells:
     return counts, packed[keep]
 
 
-def _from_offsets(offsets: IndexArray, corners: IndexArray, path: Path) -> Cells:
+def _cells_from_offsets(offsets: IndexArray, corners: IndexArray, path: Path) -> Cells:
     """Return sizes of cells and their corners, from offsets that run from 0 to the number of corners."""
     if not len(offsets):
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
@@ -378,7 +378,7 @@ def _from_offsets(offsets: IndexArray, corners: IndexArray, path: Path) -> Cells
 
 
 def write_vtk(mesh: Mesh) -> bytes:
-    """Return `mesh` as binary legacy VTK poly data (version 3.0, known to all readers), with doubles."""
+    """Return `mesh` as binary legacy VTK poly data (version 3.0, which all readers support), with doubles."""
     n = len(mesh.vertices)
     head = f"# vtk DataFile Version 3.0\nshapespace {SPACE}\nBINARY\nDATASET POLYDATA\nPOINTS {n} double\n"
     cells = np.arange(n, dtype=np.int32).reshape(-1, 1) if mesh.faces is None else mesh.faces
@@ -410,7 +410,7 @@ def _read_xml(data: bytes, path: Path) -> tuple[Mesh, list[Cells]]:
     head, mark, tail = data.partition(b"<AppendedData")
     appended = b""
     if mark:
-        # Raw data are not XML, so the XML parser sees only what comes before them.
+        # Raw data are not XML, so only the part before them is parsed.
         tag, _, body = tail.partition(b">")
         head += mark + tag + b"/></VTKFile>"
         appended = body.partition(b"_")[2]
@@ -450,11 +450,11 @@ def _read_xml(data: bytes, path: Path) -> tuple[Mesh, list[Cells]]:
             if not len(cell_ends):
                 continue
             xml.allowance.take(3 * len(corners), 8)
-            counts, corners = _from_offsets(np.concatenate([[0], cell_ends]), corners, path)
+            counts, corners = _cells_from_offsets(np.concatenate([[0], cell_ends]), corners, path)
             if cut is None:
                 lines.append((counts, corners + n_vertices))
                 continue
-            # Checked piece by piece: joined, an index past one piece would point into the next.
+            # Each piece is checked before joining, which would make an index past it refer to the next piece.
             triangles = cut(counts, corners)
             mesh_of(vertices, triangles, path)
             faces.append(triangles + n_vertices)
@@ -462,7 +462,7 @@ def _read_xml(data: bytes, path: Path) -> tuple[Mesh, list[Cells]]:
         colours.append(_piece_colours(piece, len(vertices), xml))
         n_vertices += len(vertices)
     if not points:
-        raise damage_error(path, f"it holds no points; {CUT_SHORT}")
+        raise damage_error(path, f"it contains no points; {CUT_SHORT}")
     fields = root.iterfind("PolyData/FieldData/*")
     spaces = [_data_array(a, xml).astype(np.uint8) for a in fields if a.get("Name", "").upper() == "SPACE"]
     return mesh_of(
@@ -482,13 +482,13 @@ def _piece_points(piece: ET.Element, xml: _Xml) -> FloatArray:
     values = _data_array(array, xml).astype(np.float64)
     if len(values) != 3 * declared:
         raise damage_error(
-            xml.path, f"it declares {declared} points, but holds {len(values)} numbers for them; {CUT_SHORT}"
+            xml.path, f"it declares {declared} points, but contains {len(values)} coordinates; {CUT_SHORT}"
         )
     return values.reshape(-1, 3)
 
 
 def _piece_colours(piece: ET.Element, vertices: int, xml: _Xml) -> ByteArray | None:
-    """Return the first array of bytes, three or four a point, among what is known of the points."""
+    """Return the first array of bytes with three or four components among the point data."""
     for array in piece.iterfind("PointData/DataArray"):
         width = _width(array.get("NumberOfComponents", "1").encode("ascii", "replace"))
         if array.get("type") == "UInt8" and width in _COLOUR_WIDTHS:
@@ -522,7 +522,7 @@ def _data_array(array: ET.Element, xml: _Xml) -> Values:
         raise damage_error(path, f"it has data of an unknown form '{form[:40]}'")
     if len(raw) % kind.itemsize:
         raise damage_error(path, f"it has data that end inside a number; {CUT_SHORT}")
-    # Every array becomes one of eight bytes a number.
+    # Every array is converted to eight bytes per number.
     xml.allowance.take(len(raw) // kind.itemsize, 8)
     return np.frombuffer(raw, dtype=kind)
 
@@ -533,7 +533,7 @@ def _decode(data: bytes, offset: int, is_base64: bool, xml: _Xml) -> bytes:
     if not xml.compressed:
         (length,) = _words(data, offset, 1, is_base64, xml)
         chars = 4 * -(-width // 3)
-        # Some writers encode the length by itself, which leaves padding, and others together with the data.
+        # Some writers encode the length separately, with padding at its end, and others together with the data.
         if is_base64 and data[offset : offset + chars].endswith(b"="):
             return _stream(data, offset + chars, 0, length, True, xml)
         return _stream(data, offset, width, length, is_base64, xml)
@@ -548,7 +548,7 @@ def _decode(data: bytes, offset: int, is_base64: bool, xml: _Xml) -> bytes:
     for i, length in enumerate(packed):
         want = last if i == len(packed) - 1 and last else size
         if want > _MAX_INFLATION * (length + 16):
-            raise damage_error(xml.path, f"it has a compressed block that claims {want} bytes; {CUT_SHORT}")
+            raise damage_error(xml.path, f"it has a compressed block that declares {want} bytes; {CUT_SHORT}")
         xml.allowance.take(want, 1)
         try:
             piece = zlib.decompressobj().decompress(stream[begin : begin + length], max_length=want or 1)
@@ -562,18 +562,18 @@ def _decode(data: bytes, offset: int, is_base64: bool, xml: _Xml) -> bytes:
 
 
 def _words(data: bytes, offset: int, count: int, is_base64: bool, xml: _Xml) -> list[int]:
-    """Return the `count` whole numbers at the start of an array."""
+    """Return the `count` integers at the start of an array."""
     kind = np.dtype(xml.header)
     return np.frombuffer(_stream(data, offset, 0, count * kind.itemsize, is_base64, xml), dtype=kind).tolist()
 
 
 def _stream(data: bytes, offset: int, start: int, length: int, is_base64: bool, xml: _Xml) -> bytes:
-    """Return `length` bytes from byte `start` of what `data` encodes from byte `offset` on."""
+    """Return `length` bytes, from byte `start` on, of the content that `data` encodes from byte `offset` on."""
     end = start + length
     check_count(end, 1, len(data) - offset, "bytes of data", xml.path)
     if not is_base64:
         return data[offset + start : offset + end]
-    # Arrays may lie on the same bytes, so that each counts by itself.
+    # Arrays may share bytes of the file, so each array is counted.
     xml.allowance.take(end, 1)
     try:
         raw = base64.b64decode(data[offset : offset + 4 * -(-end // 3)], validate=True)

@@ -1,6 +1,6 @@
 """Tables: a reader of CSV and Excel files, and a writer of CSV that escapes formulas.
 
-Tables may have a column `CHECKSUM` that shows any later change of a row; they are plain CSV to other programs.
+Tables may have a column `CHECKSUM` that reveals later changes of a row; other programs read them as plain CSV.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ MISSING: Final = frozenset({"", "na", "nan", "n/a", "null", "none"})
 """Cells, in lower case, that mean a missing value."""
 
 _FORMULA = re.compile(r"'*[=+\-@\t\r]")
-"""Beginning of cells that a spreadsheet would run (OWASP, CSV injection), with any apostrophes before it."""
+"""Beginning of cells that a spreadsheet would execute (OWASP, CSV injection), with any apostrophes before it."""
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[+-]?(inf|nan)")
 _DELIMITERS = (",", ";", "\t")
 _INTEGER = re.compile(r"[+-]?[0-9]+([eE][+-]?[0-9]+)?")
 _DECIMAL_COMMA = re.compile(r"[+-]?[0-9]*,[0-9]+([eE][+-]?[0-9]+)?")
 _THOUSANDS = re.compile(r"[+-]?[0-9]{1,3}(\.[0-9]{3})+,[0-9]+")
 _MOST_LACKING = 2**18
-"""Limit of the cells that rows lack, over all rows of a table; filling them takes memory beyond the file's size."""
+"""Limit of the total number of missing cells of all rows; filling them takes memory beyond the size of the file."""
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 _OLD_EXCEL = b"\xd0\xcf\x11\xe0"
 _SEPARATOR = re.compile(r'"?sep=(.)"?')
 
 
 def write_rows(path: Path, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Write a CSV table with `header`, whole or not at all.
+    """Write a CSV table with `header` atomically.
 
     Raises:
         FileError: the folder cannot be written, or the disk is full.
@@ -55,7 +55,7 @@ def table_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 
 def rows_text(rows: Iterable[Sequence[object]]) -> str:
-    """Return rows as CSV text, each ended by a line feed; text that a spreadsheet would run gets an apostrophe."""
+    """Return rows as CSV text, each ended by a line feed; text that a spreadsheet would execute gets an apostrophe."""
     text = io.StringIO()
     write_row = _row_writer(text)
     for row in rows:
@@ -64,14 +64,14 @@ def rows_text(rows: Iterable[Sequence[object]]) -> str:
 
 
 def checked_table_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Return a CSV table as text, where the column `CHECKSUM` of `header` is filled in from the others."""
+    """Return a CSV table as text, with the column `CHECKSUM` of `header` computed from the others."""
     text = io.StringIO()
     write_checked(text, header, rows)
     return text.getvalue()
 
 
 def write_checked(stream: TextIO, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Write the same to `stream`, a row at a time."""
+    """Write a CSV table as `checked_table_text` to `stream`, row by row."""
     checksum_column = header.index(CHECKSUM)
     header = [str(_escape_formula(name)) for name in header]
     write_row = _row_writer(stream)
@@ -84,7 +84,7 @@ def write_checked(stream: TextIO, header: Sequence[str], rows: Iterable[Sequence
 def _row_writer(stream: TextIO) -> Callable[[Sequence[object]], object]:
     """Return a function that writes a row of CSV to `stream`."""
     plain = csv.writer(stream, lineterminator="\n")
-    # The csv module leaves a lone carriage return without quotes, and reads it as the end of a line.
+    # The csv module does not quote a lone carriage return, but reads it as the end of a line.
     quoted = csv.writer(stream, lineterminator="\n", quoting=csv.QUOTE_ALL)
 
     def write_row(row: Sequence[object]) -> None:
@@ -121,14 +121,14 @@ def key_column(header: Sequence[str], names: Sequence[str] = KEYS) -> int | None
 
 
 def table_rows(content: bytes) -> Iterator[list[str]]:
-    """Yield the header and then the rows of a table, each as long as the header; rows of empty cells are left out.
+    """Yield the header and then the rows of a table, each as long as the header; rows of empty cells are skipped.
 
     The table is CSV with commas, semicolons or tabs, in UTF-8, UTF-16 with a byte order mark or Windows Latin-1, or the
     first sheet of an Excel workbook. In tables with semicolons or tabs, columns of numbers with decimal commas get
-    decimal points. Where a table has a column `CHECKSUM`, its rows are checked.
+    decimal points. If a table has a column `CHECKSUM`, its rows are checked.
 
     Raises:
-        ValueError: it is no table, a row has more cells than the header, or was changed; with a clause on the fault.
+        ValueError: it is not a table, or a row has more cells than the header or was changed; the message is a clause.
     """
     if content.startswith(_OLD_EXCEL):
         raise ValueError("is an Excel file of the old format (.xls); save it as .xlsx or CSV")
@@ -153,7 +153,7 @@ def table_rows(content: bytes) -> Iterator[list[str]]:
                 comma = " (with decimal commas, separate the columns by semicolons)" * (checksum_column is None)
                 raise ValueError(f"has {len(row)} cells in row {number}, and {len(raw)} columns{comma}")
             if checksum_column is not None and row_checksum(raw, row) != row[checksum_column]:
-                raise ValueError(f"was changed in row {number} since it was written, as its column {CHECKSUM} tells")
+                raise ValueError(f"was changed in row {number} since it was written: its {CHECKSUM} does not match")
             n_unchecked += len(raw) - len(row)
             if n_unchecked > _MOST_LACKING:
                 raise ValueError(f"has rows with far fewer cells than its {len(raw)} columns, such as row {number}")
@@ -166,12 +166,12 @@ def read_rows(path: Path, content: bytes | None = None) -> list[list[str]]:
     """Return the header and the rows of a table that `table_rows` reads, cells without white space at their ends.
 
     Args:
-        path: the file.
-        content: its bytes; None to read them.
+        path: path of the file.
+        content: content of the file as bytes; None to read the file.
 
     Raises:
         FileError: it cannot be read.
-        FileFormatError: it is no table.
+        FileFormatError: it is not a table.
     """
     try:
         rows = table_rows(read_bytes(path) if content is None else content)
@@ -184,20 +184,20 @@ def decoded_text(content: bytes) -> str:
     """Return the text of a file: UTF-8, UTF-16 with a byte order mark, or else Windows Latin-1 (code page 1252).
 
     Raises:
-        ValueError: it is none of them; with a clause on that.
+        ValueError: it is not text in these encodings; the message is a clause.
     """
     try:
         return content.decode("utf-16" if content.startswith(_UTF_16) else "utf-8-sig")
     except UnicodeDecodeError as error:
         if content.startswith(_UTF_16):
             raise ValueError("is not text, or UTF-16 that is cut short") from error
-        # Five bytes have no character in the code page of Windows; Latin-1 has one for each.
+        # Five bytes are undefined in code page 1252; Latin-1 defines all.
         is_undefined = any(byte in content for byte in (b"\x81", b"\x8d", b"\x8f", b"\x90", b"\x9d"))
         return content.decode("latin-1" if is_undefined else "cp1252")
 
 
 def csv_lines(text: str) -> Iterator[list[str]]:
-    """Yield the lines of text separated by commas, semicolons or tabs that have a cell, as `table_rows` describes."""
+    """Yield the cells of each line that is not empty of text with commas, semicolons or tabs, see `table_rows`."""
     first = text[: text.find("\n") + 1].strip() if "\n" in text else ""
     stated = _SEPARATOR.fullmatch(first)
     if stated and stated[1] in _DELIMITERS:
@@ -235,7 +235,7 @@ def _with_decimal_points(lines: list[list[str]]) -> list[list[str]]:
         if not with_comma or not all(_NUMBER.fullmatch(cell) for cell in other_cells):
             continue
         if any(_THOUSANDS.fullmatch(cells[n]) for n in with_comma) or not all(map(_INTEGER.fullmatch, other_cells)):
-            raise ValueError(f"writes numbers with commas and with points in the column {name[:40]!r}; use one of them")
+            raise ValueError(f"writes numbers with commas and with points in the column {name[:40]!r}; use only one")
         for number in with_comma:
             lines[number][column] = cells[number].replace(",", ".")
     return lines
@@ -249,7 +249,7 @@ def _sheet(content: bytes) -> Iterator[list[str]]:
         if last > width:
             # Cells outside the table, such as notes, would be lost without a column name.
             raise ValueError(
-                f"has a cell outside its table ({row[last - 1][:40]!r}); give that column a name, and leave no title"
+                f"has a cell outside its table ({row[last - 1][:40]!r}); give that column a name, and remove titles"
                 " above the names of columns"
             )
         line = [row.get(column, "") for column in range(width)]

@@ -1,7 +1,7 @@
 """Sheets of Excel workbooks (.xlsx, Office Open XML, ECMA-376 part 1) as rows of text, read as a stream with limits.
 
 Numbers are the text that the file stores, dates are ISO 8601, cells with the error #N/A are empty. Formulas have the
-value that was computed last; nothing is computed.
+value that the file stores; they are not evaluated.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from typing import Final
 from shapespace.io.containers.archives import zip_members
 
 WORKBOOK_START: Final = b"PK\x03\x04"
-"""The bytes with which every workbook begins."""
+"""First bytes of every workbook."""
 
 _MOST_UNPACKED = 2**26
-"""Bytes that a workbook may unpack to (64 MiB), a million cells or more."""
+"""Largest unpacked size of a workbook (64 MiB), a million cells or more."""
 _MOST_CELLS = 2_000_000  # limit on memory
 _MOST_TEXT = 2**26
-"""Characters in all cells together; one shared string may stand in many of them."""
+"""Largest number of characters in all cells together; many cells may refer to one shared string."""
 _MOST_COLUMNS = 16_384
 """Columns of a sheet in Excel (XFD)."""
-_DIGITS = 7  # of the index of a text or a style; a damaged file may have any number
+_DIGITS = 7  # limit of digits of the index of a text or a style in damaged files
 _CELL = re.compile(r"([A-Z]{1,3})[0-9]{1,7}")
 _RELATIONS = "xl/_rels/workbook.xml.rels"
 _LAST_DAY = 2_958_466
@@ -39,32 +39,32 @@ Row = Mapping[int, str]
 
 
 def sheet_rows(content: bytes, sheet: str | None = None) -> list[Row]:
-    """Return the rows of a sheet of a workbook, those without a cell left out.
+    """Return the rows of a sheet of a workbook without empty rows.
 
     Args:
-        content: of the file.
-        sheet: its name; None for the first.
+        content: content of the workbook file.
+        sheet: name of the sheet; None for the first one.
 
     Raises:
-        ValueError: it is no workbook, is damaged or too large, or has no such sheet; with a clause on the fault.
+        ValueError: it is not a workbook, is damaged or too large, or has no such sheet; the message is a clause.
     """
     try:
-        # The bound of the archive is a multiple of its size, and that of a workbook the same for all.
+        # The limit of an archive is proportional to its size; that of a workbook is constant.
         members = zip_members(io.BytesIO(content), min(len(content), _MOST_UNPACKED // 100))
     except (ValueError, OSError) as error:
-        raise ValueError(f"is no workbook, or it is cut short ({error})") from error
+        raise ValueError(f"is not a workbook, or it is cut short ({error})") from error
     book = _Elements(("sheet", "workbookPr"))
     _parse(members, "xl/workbook.xml", book)
     sheets = [attributes for tag, attributes in book.found if tag == "sheet"]
     chosen = next((entry for entry in sheets if sheet is None or entry.get("name") == sheet), None)
     if chosen is None:
-        raise ValueError(f"has no sheet called {sheet}" if sheet else "has no sheet, so it is no workbook")
+        raise ValueError(f"has no sheet called {sheet}" if sheet else "has no sheet, so it is not a workbook")
     key = next((value for name, value in chosen.items() if name.endswith("}id")), "")
     relations = _Elements(("Relationship",))
     _parse(members, _RELATIONS, relations)
     targets = {entry.get("Id"): entry.get("Target", "") for _, entry in relations.found}
     target = targets.get(key, "").removeprefix("/xl/").removeprefix("xl/")
-    shared = _Strings()
+    shared = _SharedStrings()
     if "xl/sharedStrings.xml" in members:
         _parse(members, "xl/sharedStrings.xml", shared)
     styles = _Elements(("numFmt", "xf", "cellXfs", "cellStyleXfs"))
@@ -77,7 +77,7 @@ def sheet_rows(content: bytes, sheet: str | None = None) -> list[Row]:
 
 
 class _Handler:
-    """A target of the XML parser that builds no tree, and refuses document types and entities."""
+    """A target of the XML parser that builds no tree, and rejects document types and entities."""
 
     def __init__(self) -> None:
         self.parts: list[str] = []
@@ -100,13 +100,13 @@ class _Elements(_Handler):
         self.found: list[tuple[str, dict[str, str]]] = []
 
     def start(self, tag: str, attrs: dict[str, str], /) -> None:
-        if _local(tag) in self.names:
-            self.found.append((_local(tag), attrs))
+        if _local_name(tag) in self.names:
+            self.found.append((_local_name(tag), attrs))
             if len(self.found) > _MOST_CELLS:
                 raise ValueError("has too many styles or sheets")
 
 
-class _Strings(_Handler):
+class _SharedStrings(_Handler):
     """The shared strings."""
 
     def __init__(self) -> None:
@@ -115,12 +115,12 @@ class _Strings(_Handler):
         self._phonetic = False
 
     def start(self, tag: str, attrs: dict[str, str], /) -> None:
-        name = _local(tag)
+        name = _local_name(tag)
         self.in_text = name == "t" and not self._phonetic
         self._phonetic = self._phonetic or name == "rPh"
 
     def end(self, tag: str, /) -> None:
-        name = _local(tag)
+        name = _local_name(tag)
         self.in_text = False
         if name == "rPh":
             self._phonetic = False
@@ -144,12 +144,12 @@ class _Cells(_Handler):
         self._cells = self._characters = 0
 
     def start(self, tag: str, attrs: dict[str, str], /) -> None:
-        name = _local(tag)
+        name = _local_name(tag)
         if name == "row":
             self._row, self._column = {}, -1
         elif name == "c":
             reference = _CELL.fullmatch(attrs.get("r", ""))
-            # A cell without a place follows the one before it.
+            # A cell without a reference follows the previous cell.
             self._column = _column(reference[1]) if reference else self._column + 1
             if self._column >= _MOST_COLUMNS:
                 raise ValueError("has more columns than a sheet can have")
@@ -157,7 +157,7 @@ class _Cells(_Handler):
         self.in_text = name in ("v", "t")
 
     def end(self, tag: str, /) -> None:
-        name = _local(tag)
+        name = _local_name(tag)
         self.in_text = False
         if name == "c":
             text = self._text("".join(self.parts))
@@ -173,7 +173,7 @@ class _Cells(_Handler):
 
     def _text(self, value: str) -> str:
         if self._kind == "s":
-            # A number of thousands of digits is no index, and takes quadratic time to read.
+            # A number of thousands of digits is not an index, and its conversion takes quadratic time.
             known = value.isascii() and value.isdecimal() and len(value) <= _DIGITS and int(value) < len(self._strings)
             if value and not known:
                 raise ValueError(f"is damaged: there is no shared string {value[:20]!r}")
@@ -208,7 +208,7 @@ def _parse(members: Mapping[str, bytes], name: str, target: _Handler) -> None:
         parser.feed(members.get(name, b""))
         parser.close()
     except (ET.ParseError, LookupError) as error:
-        raise ValueError(f"is no workbook, or it is damaged ({name[:60]})") from error
+        raise ValueError(f"is not a workbook, or it is damaged ({name[:60]})") from error
 
 
 def _date_styles(styles: _Elements) -> frozenset[str]:
@@ -240,5 +240,5 @@ def _column(letters: str) -> int:
     return number - 1
 
 
-def _local(tag: str) -> str:
+def _local_name(tag: str) -> str:
     return tag.rpartition("}")[2]
