@@ -21,13 +21,13 @@ Colour: TypeAlias = tuple[float, float, float]
 """Red, green, blue in [0, 1], sRGB."""
 
 CLAY: Colour = (0.80, 0.755, 0.715)
-"""A surface of which only the form is to be seen."""
+"""Colour of a surface without a map."""
 # orange; colours of this group are sRGB from 0 to 1, and differ in lightness too
 SCAN_COLOUR: Colour = (0.93, 0.66, 0.36)
 MODEL_COLOUR: Colour = (0.36, 0.58, 0.80)  # blue
 DENSE_COLOUR: Colour = (0.33, 0.66, 0.56)  # green
 UNKNOWN_COLOUR: Colour = (0.66, 0.66, 0.66)
-"""Where a map has no value."""
+"""Colour of vertices without a value."""
 WITHIN_COLOUR: Colour = (0.22, 0.53, 0.74)  # blue
 BEYOND_COLOUR: Colour = (0.95, 0.58, 0.20)
 """The two sides of a threshold."""
@@ -40,7 +40,7 @@ REGION_COLOURS: Mapping[str, Colour] = MappingProxyType(
         "unseen": (0.80, 0.80, 0.80),
     }
 )
-"""What the fit made of each part of the model, by the names of `shapespace.report.inputs.saved_fits.REGIONS`."""
+"""Colours of the regions of the model in a fit, by the names of `shapespace.report.inputs.saved_fits.REGIONS`."""
 
 # Okabe and Ito's colours, with a dark red in place of the yellow that white paper swallows.
 CATEGORIES: tuple[Colour, ...] = (
