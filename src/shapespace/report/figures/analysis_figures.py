@@ -151,7 +151,7 @@ def surface_map_figure(
         if mask is not None and not mask.all():
             pale = render(replace(full, colormap=_PALE + (1 - _PALE) * colours), camera=camera, size=size)
             image = np.rint(
-                pale + (image.astype(float) - pale) * _inside(turned_mesh, mask, camera, size)[:, :, None]
+                pale + (image.astype(float) - pale) * _mask_share(turned_mesh, mask, camera, size)[:, :, None]
             ).astype(np.uint8)
         panels.append(image)
     extend = {(True, True): "both", (True, False): "low", (False, True): "high"}.get(
@@ -166,7 +166,7 @@ def surface_map_figure(
     )
 
 
-def _inside(mesh: Mesh, mask: BoolArray, camera: Camera, size: tuple[int, int]) -> FloatArray:
+def _mask_share(mesh: Mesh, mask: BoolArray, camera: Camera, size: tuple[int, int]) -> FloatArray:
     """Return the share (H, W) of each pixel that shows triangles, or points, whose vertices are mostly in the mask."""
     width, height = size
     if mesh.faces is None:
@@ -483,7 +483,7 @@ def confusion_figure(counts: npt.ArrayLike, classes: Sequence[str], *, title: st
     high = max(min(wide, 78.0), 280 / n)
     upright = longest > 0.94 * wide
     figure, axes = chart(
-        title or _confused(table, shares, classes), height=(n * high + (longest if upright else 20) + 60) / DPI
+        title or _accuracy_sentence(table, shares, classes), height=(n * high + (longest if upright else 20) + 60) / DPI
     )
     axes.imshow(shares, cmap=ListedColormap(SEQUENTIAL), vmin=0, vmax=1, aspect="auto", interpolation="nearest")
     for k in range(1, n):
@@ -507,7 +507,7 @@ def confusion_figure(counts: npt.ArrayLike, classes: Sequence[str], *, title: st
     return figure
 
 
-def _confused(table: FloatArray, shares: FloatArray, classes: Sequence[str]) -> str:
+def _accuracy_sentence(table: FloatArray, shares: FloatArray, classes: Sequence[str]) -> str:
     """Return the accuracy and the most frequent confusion as a sentence."""
     total = float(table.sum())
     headline = f"{percent(float(np.trace(table)) / total)} of {counted(round(total), 'answer')} are right"
@@ -731,7 +731,7 @@ def curve_figure(
     axes.margins(y=0.12)
     axes.set(xscale="log" if scales[0] == "log" else "linear", yscale="log" if scales[1] == "log" else "linear")
     for axis, kind, band_limits in zip((axes.xaxis, axes.yaxis), scales, limits, strict=True):
-        _scaled(axis, kind, band_limits)
+        _set_scale(axis, kind, band_limits)
     if diagonal:
         low = max(axes.get_xlim()[0], axes.get_ylim()[0])
         high = min(axes.get_xlim()[1], axes.get_ylim()[1])
@@ -785,7 +785,7 @@ def _to_scale(values: FloatArray, kind: CurveScale, limits: tuple[float, float])
     return np.where(values > 0, values, np.nan) if kind == "log" else values
 
 
-def _scaled(axis: Axis, kind: CurveScale, limits: tuple[float, float]) -> None:
+def _set_scale(axis: Axis, kind: CurveScale, limits: tuple[float, float]) -> None:
     """Give an axis its scale and ticks that people read."""
     if kind == "log":
         plain_decades(axis)

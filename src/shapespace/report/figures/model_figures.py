@@ -189,7 +189,7 @@ def mode_animation(
         np.concatenate([mean.vertices + sign * deviations * move for sign in (-1, 1)]), 1, yaw_deg=yaw_deg, width=width
     )
     forth = [
-        _labelled(
+        _draw_label(
             render(
                 Layer(mean.with_vertices(mean.vertices + z * move)), camera=camera_view.camera, size=camera_view.size
             ),
@@ -214,7 +214,7 @@ def mode_animation(
     return stream.getvalue()
 
 
-def _labelled(image: Image, name: str, z: float, deviations: float) -> PillowImage.Image:
+def _draw_label(image: Image, name: str, z: float, deviations: float) -> PillowImage.Image:
     """Draw the mode number and a position marker below an image."""
     height, width = image.shape[:2]
     type_size = max(11, round(width / 19))
@@ -301,7 +301,7 @@ def quality_figure(quality: Quality | Mapping[str, object], *, title: str = "") 
     sizes = [item.generalisation_by_shapes for item in qualities]
     if not measures:
         raise InputError(f"There is nothing to draw: give at least one of {', '.join(_QUALITY)}.")
-    curves_by_measure = {key: [_of(key, item) for item in qualities] for key in measures}
+    curves_by_measure = {key: [_measure_lines(key, item) for item in qualities] for key in measures}
     largest_mode_count = int(
         max(modes.max() for curves in curves_by_measure.values() for lines in curves for modes, *_ in lines.values())
     )
@@ -328,14 +328,14 @@ def quality_figure(quality: Quality | Mapping[str, object], *, title: str = "") 
 _Line: TypeAlias = tuple[FloatArray, FloatArray, FloatArray | None, FloatArray | None]
 
 
-def _of(key: str, quality: Quality) -> dict[str, _Line]:
+def _measure_lines(key: str, quality: Quality) -> dict[str, _Line]:
     """Return the curves of a measure that are present: by surface or unnamed, and by vertices."""
     by_surface, by_vertices = getattr(quality, key), getattr(quality, f"{key}_vertices", None)
     out: dict[str, _Line] = {}
     if by_surface is not None:
-        out["surface" if by_vertices is not None else ""] = _measured(key, by_surface)
+        out["surface" if by_vertices is not None else ""] = _measured_line(key, by_surface)
     if by_vertices is not None:
-        out["vertices"] = _measured(key, by_vertices)
+        out["vertices"] = _measured_line(key, by_vertices)
     return out
 
 
@@ -378,7 +378,7 @@ def _legend_above(axes: Axes) -> None:
         legend_above(axes, 0.2 * -(-count // 2), loc="upper right", ncols=2)
 
 
-def _measured(key: str, value: Measured | tuple[float, ...]) -> _Line:
+def _measured_line(key: str, value: Measured | tuple[float, ...]) -> _Line:
     """Return numbers of modes, the measure for each, and where its band begins and ends if known, (n,) each."""
     measured = value if isinstance(value, Measured) else Measured(mean=value)
     mean = np.array(measured.mean)

@@ -88,7 +88,7 @@ def distributions_figure(values: Mapping[str, FloatArray], trusted: Any, *, titl
         else:
             axes.hist(parts, edges.tolist(), stacked=True, color=[FORWARD, BACKWARD], label=["converged", "others"])
             axes.set_ylabel("fits")
-        axes.set(xlabel=_wrapped(name), xlim=(edges[0], edges[-1]))
+        axes.set(xlabel=_wrap_label(name), xlim=(edges[0], edges[-1]))
         middle = float(np.median(distances[known & trusted])) if (known & trusted).any() else np.nan
         if np.isfinite(middle):
             axes.axvline(middle, color=INK, lw=1.2, ls="--")
@@ -101,7 +101,7 @@ def distributions_figure(values: Mapping[str, FloatArray], trusted: Any, *, titl
     return finish(figure)
 
 
-def _wrapped(name: str, max_length: int = 28) -> str:
+def _wrap_label(name: str, max_length: int = 28) -> str:
     return escaped("\n".join(textwrap.wrap(name, max_length)))
 
 
@@ -217,7 +217,7 @@ def over_time_figure(
                     label=escaped(short(line_name, 18)),
                 )
             legend_above(axes, 0.3, loc="upper left", ncols=4)
-        axes.set_ylabel(_wrapped(words, 16))
+        axes.set_ylabel(_wrap_label(words, 16))
     axes = plots[len(finite)]
     axes.bar(
         middles,
@@ -330,7 +330,7 @@ def scatter_matrix(points: Sequence[Coefficients], modes: int = 4, *, title: str
     handles = _handles(groups)
     if n_shown == 1:
         figure, axes = chart(heading, height=2.8)
-        _spread(axes, b[:, 0], groups)
+        _draw_distribution(axes, b[:, 0], groups)
         axes.set(xlabel="b1 (mm)", ylabel="scans")
         if handles:
             legend(axes, handles=handles, loc="upper right", handlelength=1.0)
@@ -345,7 +345,7 @@ def scatter_matrix(points: Sequence[Coefficients], modes: int = 4, *, title: str
                 axes.set_axis_off()
                 continue
             if c == r:
-                _spread(axes, b[:, c], groups)
+                _draw_distribution(axes, b[:, c], groups)
                 axes.set_yticks([])
             else:
                 for _, marker_style, scores in groups:
@@ -559,7 +559,7 @@ def _handles(
     return out + plus
 
 
-def _spread(axes: Axes, values: FloatArray, groups: Sequence[tuple[str, dict[str, Any], list[int]]]) -> None:
+def _draw_distribution(axes: Axes, values: FloatArray, groups: Sequence[tuple[str, dict[str, Any], list[int]]]) -> None:
     """Draw the distribution of `values` (n,) per label; as dots if there are few."""
     if len(values) < FEWEST_BINNED:
         for _, marker_style, scores in groups:

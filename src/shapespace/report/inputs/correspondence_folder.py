@@ -197,12 +197,12 @@ class Corresponded:
         if self._is_upright:
             return
         turns: list[FloatArray] = []
-        for record in self._of_known_pose():
+        for record in self._records_for_pose():
             with contextlib.suppress(ShapespaceError):  # `population` reports unreadable surfaces
                 turns.append(self.placed(record.name).T_scan_mean.rotation)
         self._turn_by(turns)
 
-    def _of_known_pose(self) -> list[CorrespondRecord]:
+    def _records_for_pose(self) -> list[CorrespondRecord]:
         """Return the records of the surfaces whose poses turn the mean shape upright."""
         return self.corresponding[:: max(1, len(self.corresponding) // _POSES)]
 
@@ -216,7 +216,7 @@ class Corresponded:
             on_scan: called after each scan.
         """
         if self._population is None:
-            turns, posed = list[FloatArray](), {record.name for record in self._of_known_pose()}
+            turns, posed = list[FloatArray](), {record.name for record in self._records_for_pose()}
             counts = np.zeros(len(self._mean.vertices), dtype=np.int64)
             names: list[str] = []
             sizes: list[float] = []

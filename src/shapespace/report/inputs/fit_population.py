@@ -160,7 +160,7 @@ class Population:
             for key, counts in self.origins.items():
                 counts.update(value for value in rows[key] if value)
             self.models.update(value for value in rows["model_hash"] if value)
-            models.append(_coded(rows["model_hash"], codes_of_models, 2**31))
+            models.append(_encode_texts(rows["model_hash"], codes_of_models, 2**31))
             numbers = {key: np.array(rows[key], dtype=np.float64) for key in _READ}
             measures["expected_error_mm"].append(numbers["expected_error_mm"])
             for key, direction in (("to_scan_mm", "model_to_scan"), ("to_model_mm", "scan_to_model")):
@@ -171,7 +171,7 @@ class Population:
             measures["seen_percent"].append(100 * numbers["model_seen_share"])
             z.append(np.array([rows[f"z{k}"] for k in range(1, n_modes + 1)], dtype=np.float32).T.reshape(-1, n_modes))
             for column, (codes, chunks) in coded_columns.items():
-                chunks.append(_coded(rows[column], codes, _MOST_VALUES * 400))
+                chunks.append(_encode_texts(rows[column], codes, _MOST_VALUES * 400))
         if not self.names:
             raise InputError(f"{results.folder}: none of its fits can be read; {'; '.join(results.problems[:1])}")
         self.status = np.frombuffer(bytes(statuses), dtype=np.uint8)
@@ -329,7 +329,7 @@ def _code(status: str) -> int:
     return ORDER_OF_CONCERN.index(status) if status in ORDER_OF_CONCERN else ORDER_OF_CONCERN.index("unreadable")
 
 
-def _coded(texts: Sequence[str | None], codes: dict[str, int], max_levels: int) -> npt.NDArray[np.int32]:
+def _encode_texts(texts: Sequence[str | None], codes: dict[str, int], max_levels: int) -> npt.NDArray[np.int32]:
     """Return the index of each text in `codes`, which grows; -1 for missing ones and beyond `max_levels` distinct
     texts.
     """

@@ -390,7 +390,7 @@ def command_with_stages(root: Path, records: Mapping[str, FitRecord]) -> str:
     """
     first = next(iter(records.values()))
     scans = [record.scan.path or "SCAN" for record in records.values()]
-    if not (len(records) == 1 and first.landmarks is None and not first.metadata) and _listed(
+    if not (len(records) == 1 and first.landmarks is None and not first.metadata) and _listed_names(
         root / FitRecord.LIST
     ) == set(records):
         scans = [FitRecord.LIST]
@@ -406,7 +406,7 @@ def command_with_stages(root: Path, records: Mapping[str, FitRecord]) -> str:
     return shlex.join(["shapespace", "fit", first.model.path or "MODEL.h5", *scans, "-o", ".", "--stages", *options])
 
 
-def _listed(file: Path) -> set[str]:
+def _listed_names(file: Path) -> set[str]:
     """Return the names of the results in a list of scans; none if there is no such list."""
     try:
         rows = table_rows(read_bytes(file))

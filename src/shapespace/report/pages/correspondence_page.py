@@ -108,7 +108,7 @@ class CorrespondencePage:
         self.concerns = concerns_of(self.result)
         self.ordered = sorted(self.records, key=lambda record: (-self.concerns[record.name].weight, record.name))
         self.out = [*self.result.set_aside, *(self.result.records[name] for name in self.all.unread)]
-        self._cards = {record.name: self.page.anchor(f"scan-{record.name}") for record in self._carded()}
+        self._cards = {record.name: self.page.anchor(f"scan-{record.name}") for record in self._select_cards()}
 
     # Facts of each
 
@@ -374,7 +374,7 @@ class CorrespondencePage:
             self.page.section("Every scan in numbers", self.numbers),
         ]
 
-    def _carded(self) -> list[CorrespondRecord]:
+    def _select_cards(self) -> list[CorrespondRecord]:
         first = self.out[: max(MOST_EMPTY_CARDS, MOST_CARDS - len(self.records))]
         return [*first, *self.ordered[: MOST_CARDS - len(first)]]
 
@@ -395,7 +395,7 @@ class CorrespondencePage:
             ],
             "Where areas change, shapes may differ; where they change suddenly, squares have slid.",
         )
-        carded = self._carded()
+        carded = self._select_cards()
         return [
             Text("Sorted: excluded scans first, then by their need for review."),
             no_picture(len(self.records) + len(self.out) - len(carded), "scan"),

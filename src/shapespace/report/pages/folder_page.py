@@ -127,7 +127,7 @@ class FolderPage:
         if model is not None:
             self.model()
         self._details = {fit.name: self.page.anchor(f"pictures-of-{fit.name}") for fit in self.main}
-        carded = _carded(self.fits) if len(fits) > 1 or not self.main else []
+        carded = _select_cards(self.fits) if len(fits) > 1 or not self.main else []
         self._cards = {fit.name: self.page.anchor(f"fit-{fit.name}") for fit in carded}
         self.carded = carded
 
@@ -558,7 +558,7 @@ def _main_fits(fits: Sequence[SavedFit]) -> list[SavedFit]:
     return doubtful[:1] + [others[k] for k in sorted({0, len(others) // 2})]
 
 
-def _carded(fits: Sequence[SavedFit]) -> list[SavedFit]:
+def _select_cards(fits: Sequence[SavedFit]) -> list[SavedFit]:
     """Return the fits of the gallery; if not all have room, those without a result leave some room for the others."""
     if len(fits) <= MOST_CARDS:
         return list(fits)

@@ -496,7 +496,7 @@ def study_page(folder: Folder, parts_file: PartsFile, page: Page) -> str:
         FileFormatError: it is damaged, or no file of this format.
     """
     content = _content(folder, parts_file)
-    page.planned = max(sum(_raw(part, "kind") not in ("table", "text") for part in _raw_parts(content)), 1)
+    page.planned = max(sum(_raw_value(part, "kind") not in ("table", "text") for part in _raw_parts(content)), 1)
     study = _Study(page, folder, parts_file, content)
     name = folder.root.resolve().name
     created = f", {moment(study.head['created'])}" if study.head["created"] else ""
@@ -583,27 +583,26 @@ def _analysis(page: Page, folder: Folder, root: Path) -> list[Block]:
 
 
 def _content(folder: Folder, parts_file: PartsFile) -> dict[str, Any]:
-    return cast(dict[str, Any], _shortened(Folder(folder.root, parts_file.again).json(parts_file.file)))
+    return cast(dict[str, Any], _shorten(Folder(folder.root, parts_file.again).json(parts_file.file)))
 
 
-def _shortened(value: object, most: int = _MOST_TEXT) -> object:
+def _shorten(value: object, most: int = _MOST_TEXT) -> object:
     """Return JSON content whose texts are lines of bounded length."""
     if isinstance(value, str):
         line = " ".join(value.split())
         return line if len(line) <= most else f"{line[: most - 1]}…"
     if isinstance(value, list):
-        return [_shortened(item, most) for item in cast(list[object], value)]
+        return [_shorten(item, most) for item in cast(list[object], value)]
     if isinstance(value, dict):
         mapping = cast(dict[str, object], value)
         long = ("note", "notes", "text", "summary", "settings")
         return {
-            str(_shortened(key)): _shortened(item, MOST_PARAGRAPH if key in long else most)
-            for key, item in mapping.items()
+            str(_shorten(key)): _shorten(item, MOST_PARAGRAPH if key in long else most) for key, item in mapping.items()
         }
     return value
 
 
-def _raw(part: object, key: str) -> object:
+def _raw_value(part: object, key: str) -> object:
     return cast(dict[str, object], part).get(key) if isinstance(part, dict) else None
 
 
@@ -687,7 +686,7 @@ class _Study:
         parts = _raw_parts(self.content)
         groups: list[tuple[str, list[object], list[object]]] = [(first, [], [])]
         for part in parts[:_MOST_PARTS]:
-            if _raw(part, "level") == _CHAPTER:
+            if _raw_value(part, "level") == _CHAPTER:
                 groups.append((_title(part), [part], []))
             else:
                 groups[-1][2].append(part)
@@ -713,7 +712,7 @@ class _Study:
     def parts(self, parts: Sequence[object], level: int) -> list[Block]:
         """Return parts under their headings, charts that follow each other side by side."""
         out: list[Block] = []
-        for is_chart, run in groupby(parts, lambda part: _raw(part, "kind") in _BESIDE):
+        for is_chart, run in groupby(parts, lambda part: _raw_value(part, "kind") in _BESIDE):
             made = [self.page.section(_title(part), lambda part=part: self.body(part), level) for part in run]
             out += [Group("beside", made)] if is_chart and len(made) > 1 else made
         return out
@@ -769,5 +768,5 @@ class _Study:
 
 
 def _title(part: object) -> str:
-    title, kind = _raw(part, "title"), str(_raw(part, "kind"))
+    title, kind = _raw_value(part, "title"), str(_raw_value(part, "kind"))
     return title[:200] if isinstance(title, str) and title else TITLES.get(kind, "A part")

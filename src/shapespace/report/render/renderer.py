@@ -231,11 +231,11 @@ def render_series(
         )
         if cache_key not in surfels_by_key:
             surfels_by_key[cache_key] = _surfels(layer, camera, fine, supersample)
-        pieces[id(layer)] = (_shaded(layer, surfels_by_key[cache_key]), surfels_by_key[cache_key])
-    return [_composed([pieces[id(layer)] for layer in layers], size, supersample) for layers in pictures]
+        pieces[id(layer)] = (_shade(layer, surfels_by_key[cache_key]), surfels_by_key[cache_key])
+    return [_compose_layers([pieces[id(layer)] for layer in layers], size, supersample) for layers in pictures]
 
 
-def _composed(pieces: Sequence[tuple[_Single, _Surfels]], size: tuple[int, int], supersample: int) -> Image:
+def _compose_layers(pieces: Sequence[tuple[_Single, _Surfels]], size: tuple[int, int], supersample: int) -> Image:
     """Return the nearest of shaded layers in each sample, averaged over those of each pixel, as sRGB."""
     width, height = size
     count = width * height * supersample**2
@@ -359,7 +359,7 @@ def squares(along: npt.NDArray[np.floating[Any]], across: npt.NDArray[np.floatin
     return np.where((column + row) % 2 == 0, 1 + turn, 0).astype(np.float32)
 
 
-def _unit(vectors: _Single) -> _Single:
+def _normalise(vectors: _Single) -> _Single:
     """Return (d, n) vectors normalised to length one."""
     squares = vectors[0] ** 2 + vectors[1] ** 2 + vectors[2] ** 2
     return vectors / np.sqrt(np.maximum(squares, 1e-24))
@@ -388,7 +388,7 @@ def _balls(layer: Layer, camera: Camera, size: tuple[int, int], supersample: int
         view_directions = (surface @ _view_axes(camera.yaw_deg, camera.pitch_deg).T).astype(np.float32)
         view_directions *= np.where(view_directions[:, 2:] < 0, np.float32(-1), np.float32(1))
         # A little of the ball is kept, which distinguishes a cloud from a closed surface.
-        normal = np.ascontiguousarray(_unit((view_directions[owner].T + 0.35 * normal).astype(np.float32)))
+        normal = np.ascontiguousarray(_normalise((view_directions[owner].T + 0.35 * normal).astype(np.float32)))
     scalar = (np.zeros(0) if layer.scalars is None else layer.scalars[owner]).astype(np.float32)
     depth_mm = nearest[pixel].astype(np.float32)
     is_back = np.zeros(len(pixel), dtype=np.bool_)
@@ -435,7 +435,7 @@ def _linear(colours: npt.ArrayLike) -> _Single:
     return (np.atleast_2d(np.asarray(colours, dtype=np.float64)) ** _GAMMA).astype(np.float32)
 
 
-def _shaded(layer: Layer, surfels: _Surfels) -> _Single:
+def _shade(layer: Layer, surfels: _Surfels) -> _Single:
     """Return linear colours (n, 3)."""
     out = np.empty((len(surfels.pixel), 3), dtype=np.float32)
     shade_pixels(

@@ -109,7 +109,7 @@ def pack(arrays: Mapping[str, npt.NDArray[Any] | Steps], facts: Mapping[str, Any
             if values.coded:
                 reference = arrays[values.follows] if values.follows is not None else None
                 spec["coded"] = values.follows or True
-                data = _coded(array, reference.values if isinstance(reference, Steps) else None)
+                data = _encode_differences(array, reference.values if isinstance(reference, Steps) else None)
         specs[name] = spec
         buffers.append(data + bytes(-len(data) % 8))
         offset += len(buffers[-1])
@@ -120,7 +120,7 @@ def pack(arrays: Mapping[str, npt.NDArray[Any] | Steps], facts: Mapping[str, Any
     return struct.pack("<I", len(header)) + header + bytes(-(4 + len(header)) % 8) + b"".join(buffers)
 
 
-def _coded(array: npt.NDArray[Any], reference: npt.NDArray[Any] | None) -> bytes:
+def _encode_differences(array: npt.NDArray[Any], reference: npt.NDArray[Any] | None) -> bytes:
     """Return the differences from row to row modulo 2^16, small ones of both signs as small numbers, by byte planes."""
     columns = array.shape[-1] if array.ndim > 1 else 1
     values = array.reshape(-1, columns).view(np.uint16)
@@ -587,14 +587,14 @@ def decimate(scan: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
     if _count(scan) <= largest:
         return scan, np.arange(len(scan.vertices))
     if scan.faces is not None and len(scan.faces) <= _MOST_COLLAPSED:
-        collapsed = _collapsed(scan, scan.faces, largest)
+        collapsed = _collapse_edges(scan, scan.faces, largest)
         if collapsed is not None:
             return collapsed
     cell = float(np.ptp(scan.vertices, axis=0).max()) / math.sqrt(largest)
     best: tuple[Mesh, npt.NDArray[np.intp]] | None = None
     # Of a surface, what is left goes with the inverse square of the cell, so a few steps come close to `largest`.
     for _ in range(8):
-        trial = _clustered(scan, cell)
+        trial = _cluster_on_grid(scan, cell)
         left = _count(trial[0])
         if left <= largest and (best is None or left > _count(best[0])):
             best = trial
@@ -603,12 +603,12 @@ def decimate(scan: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
         cell *= math.sqrt(max(left, 1) / (0.95 * largest))
     while best is None:
         cell *= 2.0
-        trial = _clustered(scan, cell)
+        trial = _cluster_on_grid(scan, cell)
         best = trial if _count(trial[0]) <= largest else None
     return best
 
 
-def _collapsed(scan: Mesh, faces: IntArray, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]] | None:
+def _collapse_edges(scan: Mesh, faces: IntArray, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]] | None:
     """Return the surface after edge collapse and its remaining vertices; None for a non-manifold surface."""
     try:
         _, triangles, source_rows = collapse(scan.vertices, faces, largest, scan.name)
@@ -623,7 +623,7 @@ def _count(mesh: Mesh) -> int:
     return len(mesh.vertices) if mesh.faces is None else len(mesh.faces)
 
 
-def _clustered(scan: Mesh, cell: float) -> tuple[Mesh, npt.NDArray[np.intp]]:
+def _cluster_on_grid(scan: Mesh, cell: float) -> tuple[Mesh, npt.NDArray[np.intp]]:
     points = scan.vertices
     cells = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
     side = cells.max(axis=0) + 1
