@@ -55,7 +55,7 @@ def test_a_table_of_meshes_becomes_an_answer_with_tables_in_millimetres(visits, 
     outcome = ask("--order", "before,after", "--stable", "all", "--set", f"landmarks={visits / 'marks.csv'}",
                   "--region", f"part={visits / 'part.csv'}", "--json")  # fmt: skip
     assert outcome.code == 0, outcome.err
-    assert "1 of 3 subjects are left out" in outcome.err
+    assert "1 of 3 subjects are excluded" in outcome.err
     assert outcome.facts["question"] == "change" and (tmp_path / "out" / "analysis.json").is_file()
     rows = rows_of(tmp_path / "out" / "subjects.csv")
     assert [row["subject"] for row in rows] == ["s0", "s1"]

@@ -155,7 +155,7 @@ def test_figures_draw_the_chosen_views_of_an_answer(run: Run, home: Path) -> Non
     assert "choose from svg, pdf, png" in run("figures", "out", "--format", "gif").sentence()
     assert run("figures", "same").out == "5 files in same/figures\n"  # of a correspondence
     (home / "empty").mkdir()
-    assert "holds no fits" in run("figures", "empty").sentence()
+    assert "contains no fits" in run("figures", "empty").sentence()
 
 
 def test_missing_values_are_dropped_by_every_question_of_a_cohort_that_says_so() -> None:

@@ -55,4 +55,4 @@ def test_report_writes_one_file_on_it(run: Run, same: Path, tmp_path: Path) -> N
     assert outcome.code == 0 and outcome.out == f"The report is {tmp_path / 'r.html'}\n"
     assert "Correspondence of 7 scans in same" in (tmp_path / "r.html").read_text(encoding="utf-8")
     outcome = run("report", same, "--labels", tmp_path / "l.csv", "--no-open")
-    assert outcome.code == 2 and "leave out --model and --labels" in outcome.sentence()
+    assert outcome.code == 2 and "omit --model and --labels" in outcome.sentence()

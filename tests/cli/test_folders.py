@@ -158,7 +158,7 @@ def surfaces(run: Run, world: World, tmp_path: Path) -> list[Path]:
 def test_build_leaves_surfaces_of_doubtful_fits_out_and_says_so(run: Run, surfaces: list[Path], tmp_path: Path) -> None:
     outcome = run("build", *surfaces, "-o", tmp_path / "m.h5", "--json")
     assert outcome.code == 0 and outcome.facts["training_shapes"] == 2
-    assert "1 surface of a doubtful fit is left out (scan_1.dense.ply); --with-doubtful takes them too." in outcome.err
+    assert "1 surface of a doubtful fit is excluded (scan_1.dense.ply); --with-doubtful includes them." in outcome.err
     taken = run("build", *surfaces, "-o", tmp_path / "m.h5", "--json", "--with-doubtful")
     assert taken.facts["training_shapes"] == 3
     assert "1 surface of a doubtful fit is taken too (scan_1.dense.ply)." in taken.err

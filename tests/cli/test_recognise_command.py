@@ -93,7 +93,7 @@ def test_training_says_what_it_used_and_how_well_it_does(run: Run, train: Path, 
     assert facts["cross_validation"]["macro_accuracy"] > 0.9
     again = run("recognise", "train", train, "--labels", train / "labels.csv", "-o", tmp_path / "c.skops")
     assert "lda of 4 classes from 32 scans of 8 subjects, 4 modes\n" in again.out
-    assert "macro accuracy on subjects left out: " in again.out
+    assert "macro accuracy on held-out subjects: " in again.out
 
 
 def test_answers_are_the_same_from_the_folder_and_from_the_table(run: Run, classifier: Path, new: Path, tmp_path: Path):
@@ -137,7 +137,7 @@ def test_where_no_scan_gets_an_answer_the_exit_code_is_two(run: Run, classifier:
         fail(new, f"p{person}_neutral")
     outcome = run("recognise", "predict", classifier, new, "--labels", new / "labels.csv", "-o", tmp_path / "a.csv")
     assert outcome.code == 2
-    assert "no scan could be answered for" in outcome.sentence()
+    assert "no scan could be classified" in outcome.sentence()
     assert all("no usable neutral face" in r["reason"] for r in read(tmp_path / "a.csv") if "neutral" not in r["scan"])
 
 
@@ -157,7 +157,7 @@ def test_bad_input_gives_one_sentence(run: Run, classifier: Path, train: Path, n
     (tmp_path / "people.csv").write_text("file,subject,foo\np0_smile,p0,smile\n")
     asked = [
         (("train", tmp_path / "absent", *labels, *out), "no such file"),
-        (("train", tmp_path / "empty", *labels, *out), "holds no results"),
+        (("train", tmp_path / "empty", *labels, *out), "contains no results"),
         (("train", train, *labels, "-o", tmp_path / "x.pkl"), "ends in .skops"),
         (("train", train, *labels, *out, "--classifier", "forest"), "no classifier 'forest'"),
         (("train", train, *labels, *out, "--modes", 9), "There are 4 coefficients"),

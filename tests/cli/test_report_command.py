@@ -47,7 +47,7 @@ def is_file(folder: Path) -> Path:
     ("made", "said"),
     [
         (lambda folder: folder / "absent", "no such file"),
-        (lambda folder: folder, "holds no fits"),
+        (lambda folder: folder, "contains no fits"),
         (is_file, "it"),
         (damaged, "none of its 1 records can be read"),
     ],

@@ -210,7 +210,7 @@ def test_the_command_writes_what_the_report_reads_and_curves(
     line = ["quality", str(folder), "-o", str(out), "--folds", "3", "--samples", "4", "--quiet"]
     assert cli.main(line) == 0
     said = capsys.readouterr().out
-    assert "support" in said and "mm, surface to surface, on shapes left out" in said
+    assert "support" in said and "mm, surface to surface, on held-out shapes" in said
     content = json.loads((out / "quality.json").read_text())
     assert content["settings"]["shapes"] == 12 and content["settings"]["folds"] == 3
     assert (out / "quality.png").read_bytes()[:4] == b"\x89PNG" and b"<svg" in (out / "quality.svg").read_bytes()

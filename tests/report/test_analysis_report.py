@@ -91,7 +91,7 @@ def test_every_kind_of_part_is_drawn_and_says_who_was_left_out(analysis: Path) -
     assert 'class="broken"' not in page and len(page.encode()) < LARGEST_REPORT_BYTES
     titles = [part.title for part in PARTS.values()]
     assert parsed.headings == [f"Do they differ {EVIL}", "Summary", *titles, "Settings, versions and hashes"]
-    assert NOTE in words_under(page, "Summary") and "What an analysis of shapes found." in parsed.words
+    assert NOTE in words_under(page, "Summary") and "Results of an analysis of shapes." in parsed.words
     assert len(parsed.images()) == 4 == len(steps)
     assert all(len(image["alt"] or "") > 20 for image in parsed.images())
     assert 'data-widget="morph"' in page and "2 times as large" in words_under(page, "From low to high")
@@ -192,7 +192,7 @@ def test_vertices_without_extent_or_beyond_all_measure_are_no_surface(head: Call
 
 def test_a_curve_without_a_place_on_its_scale_is_refused() -> None:
     for scale, values in (("log", [0.0, -1.0]), ("probit", [0.5, 1.5])):
-        with pytest.raises(InputError, match="scale stand"):
+        with pytest.raises(InputError, match="scale needs"):
             figures.curve_figure([("a", [1.0, 2.0], values)], x="x", y="y", scales=("linear", scale))
     figures.curve_figure([("a", [0.0, 1.0], [0.0, 1.0])], x="x", y="y", scales=("probit", "probit"), diagonal=True)
 
@@ -207,7 +207,7 @@ def test_a_key_of_another_kind_never_stops_the_report(analysis: Path, undrawn: N
 def test_an_analysis_of_another_format_is_refused_by_its_own_name(analysis: Path) -> None:
     with pytest.raises(FileFormatError, match="not the result of an analysis"):
         report(change(analysis, format="shapespace recognition"))
-    with pytest.raises(InputError, match="holds an analysis without fits; leave out --model"):
+    with pytest.raises(InputError, match="contains an analysis without fits; omit --model"):
         report(change(analysis, format="shapespace analysis"), model=analysis / "m.h5")
     (analysis / "analysis.json").write_text('{"format": ')
     with pytest.raises(FileFormatError, match="run the analysis again"):
@@ -227,7 +227,7 @@ def test_a_report_of_fits_gains_sections_of_the_analyses_in_and_below_it(
     assert page.count(NOTE) == 2 and "shapespace report FOLDER/asymmetry" in Page(page).words
     (fits / "asymmetry" / "analysis.json").write_text("[]")
     damaged = report(fits)
-    assert "does not hold a JSON object" in words_under(damaged, "Analysis asymmetry")
+    assert "does not contain a JSON object" in words_under(damaged, "Analysis asymmetry")
     assert str(fits.parent) not in damaged
 
 

@@ -53,7 +53,7 @@ def test_every_part_is_there_in_order_and_none_is_broken(page: str) -> None:
     assert "could not be made" not in page
     headings = Page(page).headings
     wanted = ["Correspondence of 7 scans in same", "Summary", "The same places on every scan"]
-    wanted += ["How near, and where nothing is shown", "The scans", "Every scan in numbers", "The rounds"]
+    wanted += ["Distances and missing vertices", "The scans", "Every scan in numbers", "The rounds"]
     at = [headings.index(text) for text in [*wanted, "Settings and hashes"]]
     assert at == sorted(at)
     levels = [int(tag[1]) for tag, _ in Page(page).tags if re.fullmatch("h[1-6]", tag)]
@@ -211,7 +211,7 @@ def test_every_picture_has_words_and_every_link_a_target(page: str) -> None:
 def test_scans_that_moved_leave_the_surface_without_its_scan(same: Path) -> None:
     shutil.rmtree(same.parent / "scans")
     words = Page(report(same)).words
-    assert "Without the scan beside it: the scan is no longer where it was, or has changed." in words
+    assert "The picture lacks the scan: the scan is no longer where it was, or has changed." in words
     assert "No picture: the scan is no longer where it was, or has changed." in words
 
 
@@ -244,7 +244,7 @@ def test_a_record_that_is_damaged_costs_itself_alone(same: Path) -> None:
 
 
 def test_a_folder_that_is_damaged_as_a_whole_is_one_sentence(same: Path) -> None:
-    with pytest.raises(InputError, match="leave out --model"):
+    with pytest.raises(InputError, match="omit --model"):
         write_report(same, model=same / "x.h5")
     mean = same / "template" / "mean.ply"
     kept = mean.read_bytes()
@@ -317,7 +317,7 @@ def test_holes_of_the_mean_shape_are_told(same: Path) -> None:
     faces = mean.faces[~np.isin(mean.faces, at).any(axis=1)]
     for path in (same / "template" / "mean.ply", *same.glob("*.corresponding.ply")):
         write_mesh(path, Mesh(read_mesh(path).vertices, faces))
-    assert "The mean shape has 2 holes beside its border." in Page(report(same)).words
+    assert "The mean shape has 2 holes in addition to its border." in Page(report(same)).words
 
 
 def test_scans_in_mixed_units_are_compared_by_their_size(same: Path) -> None:

@@ -82,7 +82,7 @@ def test_a_demo_or_a_study_damaged_anywhere_ends_in_a_page_or_one_sentence(
     try:
         write_report(study)
     except ShapespaceError as error:
-        assert "recognition" in str(error) or "holds no fits" in str(error)
+        assert "recognition" in str(error) or "contains no fits" in str(error)
 
 
 def test_distances_over_what_the_scan_shows_stand_first(fits: Path, sketched: None) -> None:
@@ -97,4 +97,4 @@ def test_distances_over_what_the_scan_shows_stand_first(fits: Path, sketched: No
     assert "over what the scan shows: model to scan 0.12 mm (62 % of the model)" in new
     assert "scan to model 0.38 mm (88 % of the scan)" in new and "Scan to model 0.38 mm on average" in new
     assert "Model to scan where shown, mean" in new and "Model shown, %" in new and "Whole model" not in new
-    assert "over what the scan shows, median of those" in new and "whole model" not in new
+    assert "where the scan shows the surface, median of the converged fits" in new and "whole model" not in new

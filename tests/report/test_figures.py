@@ -236,7 +236,7 @@ def test_the_interval_of_a_coefficient_is_in_the_units_of_its_bar(head: MakeHead
 
 
 def test_a_population_of_another_model_is_refused(head: MakeHead) -> None:
-    with pytest.raises(InputError, match="must hold 4 coefficients"):
+    with pytest.raises(InputError, match="must have 4 coefficients"):
         figures.coefficients_figure(make_fit(head(6)), population=np.zeros((10, 3)))
 
 
@@ -248,11 +248,9 @@ def test_every_figure_of_a_model_is_drawn(model: ShapeModel, modes: int) -> None
         assert picture.shape[1] == draw.WIDTH and (picture < 250).any(axis=2).mean() > 0.02
     assert len(pictures(figures.modes_figure(small, modes=9))) == 4 * modes
     told = words(figures.modes_figure(small, modes=1)) + words(figures.spectrum_figure(small))
-    assert ("one mode does" in told and "one mode holds" in told) == (modes == 1)
-    assert ("the first of 5 modes does" in told) == (modes == 5)
-    assert modes == 1 or "the first 3 of 5 modes do to" in words(figures.modes_figure(small, modes=3)).replace(
-        "\n", " "
-    )
+    assert ("Effect of the one mode" in told and "in the one mode" in told) == (modes == 1)
+    assert ("the first of 5 modes on" in told) == (modes == 5)
+    assert modes == 1 or "the first 3 of 5 modes on" in words(figures.modes_figure(small, modes=3)).replace("\n", " ")
     decoded(figures.modes_figure(replace(small, faces=None), modes=1))
 
 
@@ -443,7 +441,7 @@ def test_a_first_bar_that_towers_is_explained(head: MakeHead) -> None:
     fit = make_fit(head(10))
     even = {stage: np.geomspace(0.1, 10.0, len(fit.regions)) for stage in fit.surfaces}
     fit = replace(fit, model_to_scan_mm=even, scan_to_model_mm=even)
-    said = "The first bar holds all distances below"
+    said = "The first bar contains all distances below"
     assert said not in words(figures.distance_histograms(fit))
     near = fit.model_to_scan_mm["final"].copy()
     near[: len(near) // 2] = 1e-5
@@ -484,7 +482,7 @@ def test_modes_are_counted_from_1_to_the_last_in_whole_numbers(head: MakeHead, m
         assert low < 1 and high > modes and low + high == pytest.approx(1 + modes)
         assert high - low > 5
     title = words(figures.coefficients_figure(make_fit(head(6), modes=modes))).replace("\n", " ")
-    assert ("its coefficient, how sure it is" in title) == (modes == 1)
+    assert ("its coefficient, with uncertainty" in title) == (modes == 1)
 
 
 def scans(z: np.ndarray, expression: str, stddev: np.ndarray) -> list[figures.Coefficients]:

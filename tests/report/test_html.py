@@ -56,7 +56,7 @@ def test_the_page_needs_nothing_from_outside(page: str) -> None:
 def test_every_section_is_made_when_everything_is_there(page: str) -> None:
     assert 'class="broken"' not in page
     headings = Page(page).headings
-    for wanted in ("Summary", "The paper beside this run", "Experiment 1", "Experiment 2", "Distance maps"):
+    for wanted in ("Summary", "Comparison with the paper", "Experiment 1", "Experiment 2", "Distance maps"):
         assert wanted in headings
     order = [headings.index(name) for name in ("Summary", "Experiment 1", "Experiment 2")]
     assert order == sorted(order)
@@ -182,7 +182,7 @@ def test_arrays_with_pickles_are_refused(folder: Path) -> None:
 
 def test_a_damaged_demo_is_refused_in_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "demo.json").write_text("[1, 2]")
-    with pytest.raises(FileFormatError, match="does not hold a JSON object"):
+    with pytest.raises(FileFormatError, match="does not contain a JSON object"):
         write_report(tmp_path)
     (tmp_path / "demo.json").write_text("[" * 100_000)
     with pytest.raises(FileFormatError, match="is not JSON"):

@@ -123,7 +123,7 @@ def test_failed_and_doubtful_fits_come_first_with_their_reason(page: str) -> Non
     words = Page(page).words
     cards = re.findall(r'<li class="card" id="([^"]+)"', page)
     assert cards[:2] == ["fit-broken", "fit-charlie"]
-    assert "2 fits converged with nothing found against them" in words and "1 could not be fitted" in words
+    assert "2 fits converged with no problems detected" in words and "1 could not be fitted" in words
     assert "broken.ply" in words and "No picture: the scan cannot be read." in words
 
 
@@ -155,7 +155,7 @@ def test_messages_about_result_files_name_no_folder_of_the_machine(fits: Path, s
 
 
 def test_labels_are_found_beside_the_scans_and_can_be_given(fits: Path, sketched: None) -> None:
-    assert "Labels are from scans/labels.csv, beside the scans." in Page(report(fits)).words
+    assert "Labels are from scans/labels.csv, next to the scans." in Page(report(fits)).words
     (fits / "labels.csv").write_text("name,label\nable,LOCAL\n")
     words = Page(report(fits)).words
     assert "Labels are from labels.csv in the folder." in words and "LOCAL" in words and "calm" not in words
@@ -286,7 +286,7 @@ def test_what_turns_becomes_a_still_where_the_file_would_grow_too_large(
 def test_a_folder_without_results_is_refused_in_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(FileError, match="absent"):
         write_report(tmp_path / "absent")
-    with pytest.raises(InputError, match="holds no fits"):
+    with pytest.raises(InputError, match="contains no fits"):
         write_report(tmp_path)
     (tmp_path / "a.fit.json").write_text("{")
     with pytest.raises(InputError, match="none of its 1 records can be read"):

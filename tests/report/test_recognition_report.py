@@ -229,9 +229,9 @@ def test_a_study_of_another_format_is_refused(study: Path, content: dict[str, An
 
 
 def test_scores_without_fits_and_without_a_format_are_no_study(study: Path) -> None:
-    with pytest.raises(InputError, match="holds no fits"):
+    with pytest.raises(InputError, match="contains no fits"):
         report(write(study, {"accuracy": 0.5}))
-    with pytest.raises(InputError, match="leave out --model"):
+    with pytest.raises(InputError, match="omit --model"):
         report(write(study, contents()), model=study / "m.h5")
 
 
@@ -261,7 +261,7 @@ def test_a_large_study_stays_below_the_limit_and_says_what_is_left_out(
     page = report(write(study, content))
     assert len(page.encode()) <= LARGEST_REPORT_BYTES
     words = Page(page).words
-    assert "would make this file larger than 8 MB" in words and "13 parts are left out" in words
+    assert "would make this file larger than 8 MB" in words and "13 parts are omitted" in words
     assert len(Page(page).images()) > 20 and "&lt;" * 300 not in page
 
 

@@ -36,7 +36,7 @@ def config(**settings: Any) -> Mapping[str, Any]:
 def test_choices_are_sentences_and_numbers_say_what_they_are() -> None:
     words = told(settings_blocks([config(dense=True)], [("Report", "shapespace")]))
     assert "Unit of the scans: found from the size of each scan" in words
-    assert "Method: robust: what does not match the model is left out" in words
+    assert "Method: robust: parts of the scan that do not match the model are excluded" in words
     assert "beyond share | 0.2 | smallest share of the residuals' variance outside the model" in words
     assert "all | 20,000 | 1,500 | triangles | 15 | 0.05" in words
     assert "All numbers of the dense stage" in words and "local share | 0.03 | variance of the local modes" in words

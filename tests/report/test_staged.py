@@ -182,7 +182,7 @@ def test_a_damaged_record_is_told_and_does_not_hide_the_others(home: Path) -> No
 
 
 def test_a_folder_without_fits_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="holds no fits"):
+    with pytest.raises(InputError, match="contains no fits"):
         find_fits(Folder(tmp_path))
 
 

@@ -547,7 +547,7 @@ PAIR = {"subject": [*"aabb"], "visit": ["before", "after"] * 2}
 def test_subjects_with_one_visit_are_counted_and_left_out() -> None:
     found = asked(cells(subject=[*"aabbc"], visit=[*["before", "after"] * 2, "before"]))
     assert found.single_visit_subjects == ("c",) and len(found.subjects) == 2
-    assert "1 of 3 subjects are left out, who have one visit (c)." in analysis_report(found).notes
+    assert "1 of 3 subjects are excluded because they have one visit (c)." in analysis_report(found).notes
     assert "none of its 3 subjects has two visits" in refusal(cells(subject=[*"abc"], visit=[1, 1, 1]))
 
 

@@ -717,7 +717,7 @@ def test_auto_reports_the_test_that_holds_first_and_p_with_equal_variances_in_th
     assert f"without the assumption of equal variances; p {p:.3g} with it)" in report.summary[0]
     (sex, _) = analysis_report(equal).summary[:2]
     assert re.search(r"p 0\.005, which is too small: it assumes equal variances; p 0\.\d+ without this assumption", sex)
-    (table,) = [part for part in report.parts if isinstance(part, TablePart) and part.title == "What shape varies with"]
+    (table,) = [part for part in report.parts if isinstance(part, TablePart) and part.title == "Analysis of variance"]
     assert [column.name for column in table.columns[-2:]] == ["F, equal variances", "p, equal variances"]
     assert table.rows[0][-1] == p and table.rows[-1][-1] is None
 
@@ -915,6 +915,10 @@ def test_whether_changes_have_one_direction_is_not_known_where_neither_is_longer
             [angle] = [one for one in found.angles if one.first.startswith("time t0 to t1, group")]
             assert (angle.p is None) == (angle.unknown_p is not None)
             unknown[length] += angle.p is None
-            warned = [one for one in compare_warnings(found) if one.startswith("Whether the changes time t0 to t1")]
+            warned = [
+                one
+                for one in compare_warnings(found)
+                if one.startswith("It is not known whether the changes time t0 to t1")
+            ]
             assert len(warned) == (angle.p is None)
     assert unknown[6.0] == 0 and 0 < unknown[0.0] < 8

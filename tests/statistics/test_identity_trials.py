@@ -179,7 +179,7 @@ def test_a_rate_that_the_pairs_cannot_show_is_not_stated(found):
     assert 100 < impostors < 1000
     assert found.scores[0].tar[1e-3].value is None
     assert found.scores[0].tar[1e-2].value is not None
-    assert any("30 are wanted" in note for note in analysis_report(found).notes)
+    assert any("30 are needed" in note for note in analysis_report(found).notes)
 
 
 def test_the_same_seed_gives_the_same_and_another_parts_the_people_anew():

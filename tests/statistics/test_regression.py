@@ -388,7 +388,7 @@ def test_the_answer_says_that_a_sample_is_small_and_can_be_read(learned: Regress
     assert "60 subjects are a small sample (fewer than 100)" in said and "4 new shapes are predicted" in said
     assert "Their age is known: RMSE" in said
     told = json.loads(answer.save(tmp_path).read_text())
-    assert [read_part(part, "part").title for part in told["parts"]][:2] == ["On subjects left out", "Calibration"]
+    assert [read_part(part, "part").title for part in told["parts"]][:2] == ["On held-out subjects", "Calibration"]
     assert told["methods"]["subjects"] == 60
     assert {test["resampling"] for test in told["methods"]["tests"]} <= {"permutation", "bootstrap"}
     rows = (tmp_path / "predictions.csv").read_text().splitlines()

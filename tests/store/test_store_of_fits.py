@@ -488,7 +488,7 @@ def test_build_leaves_out_doubtful_fits_of_a_store(
     store: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(["build", str(store), "-o", str(tmp_path / "m.h5"), "--modes", "all"]) == 0
-    assert "doubtful fits are left out (scan004.dense.ply" in capsys.readouterr().err.replace("2 surfaces of ", "")
+    assert "doubtful fits are excluded (scan004.dense.ply" in capsys.readouterr().err.replace("2 surfaces of ", "")
 
 
 def test_recognition_reads_a_store_as_it_reads_its_files(store: Path, singles: Path) -> None:

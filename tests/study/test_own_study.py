@@ -64,7 +64,7 @@ def test_everybody_has_a_prediction_or_counts_as_wrong(studied: Path) -> None:
     confusion = next(part for part in made["parts"] if part["kind"] == "confusion")
     assert confusion["classes"] == ["smile", "surprise"]
     assert np.sum(confusion["counts"]) == 9 and "1 without an answer" in confusion["note"]
-    told = next(part for part in made["parts"] if part["title"] == "What was tested")["text"]
+    told = next(part for part in made["parts"] if part["title"] == "Data and protocol")["text"]
     assert any("1 failed" in line for line in told) and any("5 subjects" in line for line in told)
     rows = next(part for part in made["parts"] if part["title"] == "Classifiers on unseen people")["rows"]
     assert {row[0] for row in rows} == {"all coefficients", "expression coefficients of the additive model"}

@@ -1,1 +1,1 @@
-"""What each command of the command line does, as plain functions; `cli` only parses and prints."""
+"""The commands of the command line as plain functions; `cli` only parses and prints."""

@@ -1,4 +1,4 @@
-"""What `align` does: landmarks of many specimens aligned, checked and written."""
+"""Command `align`: align, check and write the landmarks of many specimens."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def align(
     links, figures draw the curves.
 
     Args:
-        data: landmark file, or folder of them.
+        data: landmark file, or folder of landmark files.
         folder: output folder.
         config: options; None for the defaults.
         table: covariates, with a row for each specimen.
@@ -65,12 +65,12 @@ def align(
     raw = read_configurations(data, sliders=sliders, curve_points=curve_points, dimensions=dimensions)
     config = with_criterion(config or AlignConfig(), raw)
     if separate is not None:
-        config = replace(config, structures=_structures(separate))
+        config = replace(config, structures=_read_structures(separate))
     if table is not None:
         _, covariates, notes = join_table(raw.names, raw.columns, table, raw.where, keep_unmatched=True)
         raw = replace(raw, columns=covariates.columns, notes=(*raw.notes, *notes))
     if reflect is not None:
-        raw = _reflected(raw, *reflect)
+        raw = _reflect_specimens(raw, *reflect)
     orientation = find_orientation(None, [data if data.is_dir() else data.parent], raw.landmarks, raw.curve_links)
     aligned = align_landmarks(raw, config)
     findings = find_outliers(aligned)
@@ -99,7 +99,7 @@ def align(
     return aligned, record
 
 
-def _reflected(raw: LandmarkConfigurations, column: str, value: str) -> LandmarkConfigurations:
+def _reflect_specimens(raw: LandmarkConfigurations, column: str, value: str) -> LandmarkConfigurations:
     cells = Table(raw.columns, raw.names, raw.where).texts(column)
     rows = [k for k, cell in enumerate(cells) if cell == value]
     if not all(cells):
@@ -113,7 +113,7 @@ def _reflected(raw: LandmarkConfigurations, column: str, value: str) -> Landmark
     return replace(raw, points=points, notes=(*raw.notes, note))
 
 
-def _structures(path: Path) -> dict[str, str]:
+def _read_structures(path: Path) -> dict[str, str]:
     header, *rows = read_rows(path)
     landmark, structure = (key_column(header, (name,)) for name in ("landmark", "structure"))
     if landmark is None or structure is None:

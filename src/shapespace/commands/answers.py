@@ -17,7 +17,7 @@ def write_answer(report: AnalysisReport, output: Path, *, quiet: bool) -> Outcom
     """Write the report of an analysis to a folder, with its HTML page if the extra `report` is installed.
 
     Args:
-        report: of the analysis.
+        report: report of the analysis.
         output: the folder.
         quiet: no progress.
 
@@ -60,7 +60,7 @@ def write_report(folder: Path, output: Path | None, *, model: Path | None, label
 
     Raises:
         FileError: something in it cannot be read, or the report not written.
-        InputError: the folder holds no results, or `model` is not of its fits.
+        InputError: the folder contains no results, or `model` is not of its fits.
         ShapespaceError: the extra `report` is not installed.
     """
     from shapespace.report.pages import write_html as html

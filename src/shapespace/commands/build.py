@@ -1,4 +1,4 @@
-"""What `build` does: meshes in correspondence to a model file."""
+"""Command `build`: meshes in correspondence to a model file."""
 
 from __future__ import annotations
 
@@ -60,11 +60,11 @@ class BuildFilesConfig:
         landmarks: landmarks of the model: points on the first mesh in any landmark format, a CSV of name,vertex, or
             `landmarks.csv` of correspond (default: landmarks.csv next to the first mesh, otherwise those of the model
             of fitted surfaces).
-        regions: name -> file with its vertices of the meshes, kept in the model for fits that are held to one.
+        regions: name -> file with its vertices of the meshes, kept in the model for fits that are restricted to one.
         labels: separate identity and expression: CSV of file, subject and label, with a neutral face of each subject;
             the number of modes then counts modes of identity (`auto`: 0.995 of the variance).
-        expression_variance: for a model of identity and expression: share of the expression variance that its
-            expression modes explain (default 0.99).
+        expression_variance: share of the expression variance that the expression modes explain, for a model of identity
+            and expression (default 0.99).
         keep_shapes: keep the aligned shapes as MODEL.h5.shapes, so that meshes can be added later (4 bytes per
             coordinate of a mesh).
         add: add the meshes to this model, which was built with its shapes kept; gauge, alignment and landmarks are
@@ -74,7 +74,7 @@ class BuildFilesConfig:
             counted), and use a correspondence in which more than half of the surfaces need review.
 
     Raises:
-        InputError: options that do not go together.
+        InputError: options that exclude each other.
     """
 
     model: BuildConfig = field(default_factory=BuildConfig)
@@ -95,7 +95,7 @@ class BuildFilesConfig:
         if self.labels is None and self.expression_variance is not None:
             raise InputError("--expression-variance belongs to --additive LABELS.csv; give both, or neither.")
         if self.labels is not None and self.model.representation != "vertices":
-            raise InputError("A model that parts identity and expression holds vertices; leave --representation out.")
+            raise InputError("A model of identity and expression contains vertices; omit --representation.")
         if self.min_seen is not None and (self.labels is not None or self.model.representation != "vertices"):
             raise InputError("--min-seen is for models of vertices without --additive; leave it out.")
         if self.labels is not None and not self.model.align:
@@ -108,7 +108,7 @@ class BuildFilesConfig:
                 "or --representation and --additive."
             )
         if self.streams and self.min_seen is not None:
-            raise InputError("Streamed meshes must be whole, so leave --min-seen out.")
+            raise InputError("Streamed meshes must be complete, so omit --min-seen.")
         if self.add is not None and (self.gauge is not None or not self.model.align or self.landmarks is not None):
             raise InputError(
                 "--add takes gauge, alignment and landmarks from the model; leave --gauge, --no-align and --landmarks "
@@ -121,7 +121,7 @@ class BuildFilesConfig:
 
     @property
     def streams(self) -> bool:
-        """Whether the meshes are streamed even where they would fit."""
+        """Whether the meshes are streamed even if they would fit in memory."""
         return bool(self.model.out_of_core) or self.keep_shapes or self.add is not None
 
     @property
@@ -133,17 +133,17 @@ class BuildFilesConfig:
 def build(
     meshes: Sequence[Path], output: Path, config: BuildFilesConfig, *, quiet: bool
 ) -> tuple[ShapeModel, list[str]]:
-    """Build a model from mesh files and save it; return it and what the user should know.
+    """Build a model from mesh files and save it; return it with notes for the user.
 
-    Surfaces of fits lead to their records: those of doubtful fits are left out unless asked for, and the landmarks of
-    the model that fitted them hold for them too.
+    Surfaces of fits are read with their records: surfaces of doubtful fits are excluded unless they are requested, and
+    the landmarks of the model of the fits are used.
 
     Raises:
         FileError: a mesh cannot be read, or the model not written.
-        FileFormatError: the record beside a surface is damaged.
+        FileFormatError: the record next to a surface is damaged.
         MeshError: a mesh without vertices, or with faces that point past their end.
         CorrespondenceError: the meshes differ in vertices or triangles.
-        InputError: too few meshes, no variation, too many modes asked for; a model that none can be added to.
+        InputError: too few meshes, no variation, too many modes, or a model to which no meshes can be added.
     """
     if output.suffix.lower() not in (".h5", ".hdf5"):
         raise InputError(f"{output}: a model file is HDF5, so give it a name that ends in .h5.")
@@ -151,13 +151,13 @@ def build(
         meshes, "--with-doubtful", recursive=config.recursive, with_doubtful=config.with_doubtful
     )
     notes = [*([f"{summary}."] if (summary := review_summary(review)) else []), *listed.notes]
-    parent = None if config.add is None else _parent(config.add, output)
+    parent = None if config.add is None else _load_parent(config.add, output)
     gauge = parent.gauge if parent is not None else config.gauge or "shape"
     if gauge == "form" or not config.model.align:
         listed.refuse_mixed_units()
-    files, records = _trusted(listed.files, notes, with_doubtful=config.with_doubtful)
+    files, records = _exclude_doubtful(listed.files, notes, with_doubtful=config.with_doubtful)
     make_folder(output.absolute().parent)
-    on_disk = SurfacesOnDisk(files, listed, config.unit, ", so no shape model can be made of it; leave it out")
+    on_disk = SurfacesOnDisk(files, listed, config.unit, ", so no shape model can be built from it; omit it")
     streamed = config.streams or (
         config.of_vertices
         and bool(streaming_note(on_disk, modes=config.model.modes, out_of_core=config.model.out_of_core))
@@ -166,7 +166,7 @@ def build(
     first = on_disk[0] if streamed else loaded[0]
     if listed.unit_ratios:
         notes.append(listed.unit_note(config.unit))
-    marks = SurfaceLandmarks() if parent is not None else _landmarks(files, records, first, config, notes)
+    marks = SurfaceLandmarks() if parent is not None else _find_landmarks(files, records, first, config, notes)
     regions = {
         name: region_vertices(read_region(file), len(first.vertices), name) for name, file in config.regions.items()
     }
@@ -182,11 +182,11 @@ def build(
     config = replace(config, model=chosen)
     additive = None
     if streamed:
-        model = _streamed(on_disk, output, config, parent, quiet=quiet)
+        model = _build_streamed(on_disk, output, config, parent, quiet=quiet)
     else:
         with waiting(f"aligning {len(files)} meshes and finding their modes", quiet=quiet):
             if config.labels is not None:
-                additive, unmatched = _additive(files, loaded, config.labels, config)
+                additive, unmatched = _fit_additive(files, loaded, config.labels, config)
                 notes += unmatched
                 notes.append(
                     f"It parts {additive.n_identity} modes of identity and {additive.n_expression} of expression, by "
@@ -226,7 +226,7 @@ def build_from_files(
         config: other options.
         variance: share of the variance that determines the number of modes, or None.
         region: names of regions and files of their vertices.
-        arguments: of the command line; they get `goes_on`, of the message after an interruption.
+        arguments: arguments of the command line; `goes_on`, the end of the message on an interruption, is set.
         quiet: no progress.
 
     Raises:
@@ -235,13 +235,13 @@ def build_from_files(
     model = model if variance is None else replace(model, modes=variance)
     config = replace(config, model=model, regions=dict(region))
     if config.streams:
-        arguments.goes_on = "; the same command goes on from there"
+        arguments.goes_on = "; the same command continues from there"
     built, notes = build(meshes, output, config, quiet=quiet)
     facts = model_facts(built)
     line = (
         f"{output}: {facts['modes']} modes of {facts['vertices']} vertices from {facts['training_shapes']} meshes, "
         f"{100 * facts['variance_held']:.2f} % of "
-        f"{'the variance of subjects left out' if built.held_out else 'their variance'}, gauge {facts['gauge']}"
+        f"{'the variance of held-out subjects' if built.held_out else 'their variance'}, gauge {facts['gauge']}"
     )
     return Outcome({"model": str(output), **facts}, [line], notes)
 
@@ -251,11 +251,11 @@ def shapes_folder(model: Path) -> Path:
     return model.with_name(f"{model.name}.shapes")
 
 
-def _parent(path: Path, output: Path) -> ShapeModel:
+def _load_parent(path: Path, output: Path) -> ShapeModel:
     """Return the model that meshes are added to.
 
     Raises:
-        InputError: it is none that meshes can be added to.
+        InputError: no meshes can be added to the model.
     """
     if path.absolute() == output.absolute():
         raise InputError(f"{output} is the model that meshes are added to; give another name for the new one.")
@@ -266,11 +266,11 @@ def _parent(path: Path, output: Path) -> ShapeModel:
     return model
 
 
-def _streamed(
+def _build_streamed(
     meshes: SurfacesOnDisk, output: Path, config: BuildFilesConfig, parent: ShapeModel | None, *, quiet: bool
 ) -> ShapeModel:
     """Build a model of meshes that are not held in memory."""
-    scratch = Scratch(output.with_name(f"{output.name}.build"), _identity(meshes, config, parent))
+    scratch = Scratch(output.with_name(f"{output.name}.build"), _hash_inputs(meshes, config, parent))
     shapes_kept_in = shapes_folder(output) if config.keep_shapes else None
     with progress(None, "streaming", "mesh", quiet=quiet) as bar:
         log = bar.set_description_str
@@ -279,19 +279,19 @@ def _streamed(
             return build_model(meshes, chosen, scratch=scratch, keep_shapes=shapes_kept_in, log=log)
         chosen = replace(
             config.model,
-            provenance=_joined(parent.provenance, config.model.provenance),
-            licence=_joined(parent.licence, config.model.licence),
+            provenance=_join_texts(parent.provenance, config.model.provenance),
+            licence=_join_texts(parent.licence, config.model.licence),
         )
         shapes = shapes_folder(config.add)
         return extend_model(parent, meshes, shapes, chosen, scratch=scratch, keep_shapes=shapes_kept_in, log=log)
 
 
-def _joined(old: str, new: str) -> str:
+def _join_texts(old: str, new: str) -> str:
     return old if new in ("", old) else f"{old}; {new}" if old else new
 
 
-def _identity(meshes: SurfacesOnDisk, config: BuildFilesConfig, parent: ShapeModel | None) -> str:
-    """Return a hash of all that decides what a streamed build comes to."""
+def _hash_inputs(meshes: SurfacesOnDisk, config: BuildFilesConfig, parent: ShapeModel | None) -> str:
+    """Return a hash of all inputs of a streamed build."""
     digest = hashlib.sha256(
         repr((__version__, replace(config, model=replace(config.model, provenance="", licence="")))).encode()
     )
@@ -305,7 +305,7 @@ def _identity(meshes: SurfacesOnDisk, config: BuildFilesConfig, parent: ShapeMod
     return digest.hexdigest()
 
 
-def _trusted(
+def _exclude_doubtful(
     files: Sequence[Path], notes: list[str], *, with_doubtful: bool
 ) -> tuple[list[Path], dict[Path, FitRecord]]:
     """Return `files` without surfaces of doubtful fits, and the records of those that are surfaces of fits."""
@@ -330,11 +330,11 @@ def _trusted(
         raise InputError(
             f"All meshes are surfaces of doubtful fits ({named}); --with-doubtful takes them all the same."
         )
-    notes.append(f"{count_text} left out ({named}); --with-doubtful takes them too.")
+    notes.append(f"{count_text} excluded ({named}); --with-doubtful includes them.")
     return left, {file: records[file] for file in left if file in records}
 
 
-def _landmarks(
+def _find_landmarks(
     files: Sequence[Path],
     records: Mapping[Path, FitRecord],
     first: Mesh,
@@ -401,23 +401,23 @@ def _read_landmarks(path: Path, first: Mesh, mm: float, notes: list[str]) -> Sur
 
 
 def _with_origin(files: Sequence[Path], config: BuildFilesConfig, notes: list[str]) -> BuildFilesConfig:
-    """Return the configuration with provenance and licence, from beside the meshes where none was given."""
+    """Return the configuration with provenance and licence, read from the folder of the meshes if none was given."""
     abouts = {folder: read_about(folder) for folder in dict.fromkeys(file.parent for file in files)}
     about = abouts[files[0].parent]
     if about and not (config.model.provenance or config.model.licence):
         if len(set(abouts.values())) == 1:
             notes.append(f"Provenance and licence are taken from {files[0].parent / ABOUT}.")
-            return _with_words(config, f"{len(files)} meshes of: {about[0]}", about[1])
+            return _with_provenance(config, f"{len(files)} meshes of: {about[0]}", about[1])
         notes.append("The meshes come from folders of different origin, so give --provenance and --licence.")
     provenance = config.model.provenance or f"{len(files)} meshes, {files[0].name} to {files[-1].name}"
-    return _with_words(config, provenance, config.model.licence)
+    return _with_provenance(config, provenance, config.model.licence)
 
 
-def _with_words(config: BuildFilesConfig, provenance: str, licence: str) -> BuildFilesConfig:
+def _with_provenance(config: BuildFilesConfig, provenance: str, licence: str) -> BuildFilesConfig:
     return replace(config, model=replace(config.model, provenance=provenance, licence=licence))
 
 
-def _additive(
+def _fit_additive(
     files: Sequence[Path],
     meshes: Sequence[Mesh],
     labels: Path,

@@ -1,4 +1,4 @@
-"""What `cache` does: it prints the folder and the size of the cache, or clears it."""
+"""Command `cache`: print the folder and the size of the cache, or clear it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from shapespace.io import disk_cache
 
 
 def cache(*, clear: bool) -> Outcome:
-    """Return the folder and the size of the cache on disk, after it was cleared if that is asked for."""
+    """Return the folder and the size of the cache on disk, after it was cleared if `clear`."""
     if clear:
         disk_cache.clear()
     folder, entries = disk_cache.entries_folder(), disk_cache.entries()

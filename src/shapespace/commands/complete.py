@@ -1,4 +1,4 @@
-"""What `complete` does: a model and partial scans in files to completed surfaces and samples in a folder."""
+"""Command `complete`: a model and partial scans in files to completed surfaces and samples in a folder."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from shapespace.store.corresponding import review_of_provenance
 
 @dataclass(frozen=True)
 class CompletionFiles:
-    """Input files of completions, and what is written.
+    """Input files of completions, and the formats of the output.
 
     Args:
         landmarks: landmarks of the one scan, or a folder with a file for each scan, named after it.
@@ -47,16 +47,16 @@ def complete_scans(
     say: Callable[[str], None],
     on_completion: Callable[[str, Completion], None],
 ) -> dict[str, str]:
-    """Write NAME.ply and NAME.samples.npz of each scan into `folder`; return NAME -> why, of scans that failed.
+    """Write NAME.ply and NAME.samples.npz of each scan into `folder`; return NAME -> reason for scans that failed.
 
     Args:
-        model_path: the model's file.
-        scans: files, folders, patterns, addresses and lists, as of `fit`.
-        folder: where results go.
+        model_path: file of the model.
+        scans: files, folders, patterns, addresses and lists, see `fit`.
+        folder: folder of the results.
         config: settings.
-        files: landmarks, and what is written.
+        files: landmarks, and the formats of the output.
         quiet: no progress.
-        say: called with what was not taken, and with why scans failed.
+        say: called with messages on skipped files and on scans that failed.
         on_completion: called with NAME and completion of each scan.
 
     Raises:

@@ -1,4 +1,4 @@
-"""What `convert` does: shape models from the formats of other tools to shapespace's own, and on to others."""
+"""Command `convert`: shape models from the formats of other tools to shapespace's own, and on to others."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ def convert(
     expressions: Path | None = None,
     quiet: bool = False,
 ) -> Outcome:
-    """Write the model in `source` to `output`, and say what became of it.
+    """Write the model in `source` to `output`, and note what the new format lacks.
 
     Args:
         source: a model in any format that is read.
-        output: its name tells the format, where `to` does not.
+        output: output file; its extension determines the format unless `to` is given.
         to: format to write, by its name, if the extension of the output does not determine it.
         unit: unit of `source` if its format does not contain it; None for the unit of the format, or mm.
         expressions: blendshapes that eos keeps in a file of their own.
@@ -40,13 +40,13 @@ def convert(
 
     Raises:
         FileError: `source` cannot be read, or `output` not written.
-        InputError: an unknown format, one that is only read, or one that cannot hold the model.
+        InputError: an unknown format, one that is only read, or one that cannot represent the model.
     """
-    target, mm = _target(output, to), None if unit is None else MM_PER_UNIT[unit]
+    target, mm = _target_format(output, to), None if unit is None else MM_PER_UNIT[unit]
     if source.resolve() == output.resolve():
         raise InputError(f"{output} is the model itself; give another name to write to.")
     with waiting(f"reading {source.name}", quiet=quiet):
-        model, of, notes = _load(source, mm, expressions)
+        model, of, notes = _load_model(source, mm, expressions)
         linear = model.as_linear()
     model, left_out = _without_training_shapes(model)
     notes += left_out
@@ -62,10 +62,10 @@ def convert(
             "place for."
         )
     if "research" in linear.licence.lower() or "non-commercial" in linear.licence.lower():
-        notes.append(f"The licence holds for the new file too: {linear.licence.rstrip('.')}.")
+        notes.append(f"The licence applies to the new file too: {linear.licence.rstrip('.')}.")
     into = OWN[0] if target is None else target.title
     facts = {"source": of, "target": into, "output": str(output), "notes": notes}
-    lines = [f"{output} ({into}) holds the model of {source} ({of}).", *(f"  {note}" for note in notes)]
+    lines = [f"{output} ({into}) contains the model of {source} ({of}).", *(f"  {note}" for note in notes)]
     return Outcome(facts, lines)
 
 
@@ -81,14 +81,14 @@ def _without_training_shapes(
     return shape if isinstance(model, ShapeModel) else replace(model, shape=shape), [note]
 
 
-def _target(output: Path, to: str | None) -> ModelFormat | None:
-    named = any(output.name.lower().endswith(tuple(one.suffixes)) for one in MODEL_FORMATS.values())
+def _target_format(output: Path, to: str | None) -> ModelFormat | None:
+    named = any(output.name.lower().endswith(tuple(model_format.suffixes)) for model_format in MODEL_FORMATS.values())
     if to == OWN[0] or (to is None and not named and output.suffix.lower() in OWN[1]):
         return None
     return format_to_write(output, to)
 
 
-def _load(
+def _load_model(
     source: Path, mm: float | None, expressions: Path | None
 ) -> tuple[ShapeModel | AdditiveModel, str, list[str]]:
     if not is_foreign(source):

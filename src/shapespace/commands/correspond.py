@@ -1,4 +1,4 @@
-"""What `correspond` does: raw scans in files to the same surfaces in correspondence, in a folder that `build` takes."""
+"""Command `correspond`: raw scans in files to the same surfaces in correspondence, in a folder that `build` takes."""
 
 from __future__ import annotations
 
@@ -54,13 +54,13 @@ Say: TypeAlias = Callable[[str], None]
 
 @dataclass(frozen=True)
 class CorrespondFiles:
-    """What is brought into correspondence, and how.
+    """Input files of a correspondence, and its execution.
 
     Args:
-        scans: files, folders, patterns, addresses and lists of these.
-        template: a mesh to begin with, or None.
-        model: to begin with, or None.
-        landmarks: a folder of files that are named as the scans, or None.
+        scans: files, folders, patterns, addresses and lists of scans.
+        template: mesh of the first template, or None.
+        model: model of the first template, or None.
+        landmarks: folder of landmark files that are named as the scans, or None.
         execution: Executor of the registrations.
         recursive: take scans in folders below those given too.
         strict: exclude scans with triangles that use vertices with non-finite coordinates.
@@ -85,9 +85,9 @@ def correspond_files(
     quiet: bool,
     say: Say,
 ) -> tuple[CorrespondenceRecord, list[CorrespondRecord]]:
-    """Bring scans from files into correspondence and write what came of each into `folder`.
+    """Bring scans from files into correspondence and write the result of each scan into `folder`.
 
-    What was done is kept in the folder until the end, so the same command goes on from there after an interruption.
+    Finished work stays in the folder until the end, so the same command continues from there after an interruption.
 
     Raises:
         FileError: the results cannot be written.
@@ -96,7 +96,7 @@ def correspond_files(
     jobs = find_jobs(files, folder, say)
     with CorrespondenceFolder(make_folder(folder)).writing() as results:
         marks = LandmarkFiles.of(files.landmarks)
-        marks.refuse_shared([job.scan for job in jobs if job.landmarks is None])
+        marks.check_not_shared([job.scan for job in jobs if job.landmarks is None])
         subjects = _subjects_of(jobs, files.subjects)
         inputs_hash = inputs_hash_of(jobs, marks, files, config)
         if (finished := results.finished(inputs_hash, [job.name for job in jobs])) is not None:
@@ -117,7 +117,7 @@ def correspond_files(
             )
 
         made, records = bring(jobs, read, marks, files, results, make, quiet=quiet, say=say)
-        # Until all is written the folder is none that build takes.
+        # Until all is written, build must not accept the folder.
         remove_file(results.path / SUMMARY)
         summary = CorrespondenceRecord(
             template=made.why, vertices=len(made.template.vertices), rounds=list(made.moved), corresponding=[],
@@ -157,14 +157,14 @@ def find_jobs(files: CorrespondFiles, folder: Path, say: Say) -> list[Job]:
         InputError: there are no scans, or two would have one name.
     """
     given = given_scans(files.scans, folder, recursive=files.recursive, say=say)
-    distinct = list({one.source: one for one in given}.values())
-    scans = [one for one in distinct if not one.path.name.endswith(SURFACE)]
+    distinct = list({scan.source: scan for scan in given}.values())
+    scans = [scan for scan in distinct if not scan.path.name.endswith(SURFACE)]
     if len(scans) < len(distinct):
         say(f"{len(distinct) - len(scans)} surfaces of an earlier correspondence are not taken for scans.")
-    paths = [one.path for one in scans]
-    names = names_for(paths, None, {one.path: one.address for one in scans if one.address})
+    paths = [scan.path for scan in scans]
+    names = names_for(paths, None, {scan.path: scan.address for scan in scans if scan.address})
     return with_ids(
-        [Job(n, one.path, one.landmarks, address=one.address) for n, one in zip(names, scans, strict=True)], scans
+        [Job(n, scan.path, scan.landmarks, address=scan.address) for n, scan in zip(names, scans, strict=True)], scans
     )
 
 
@@ -179,7 +179,7 @@ def bring(
     quiet: bool,
     say: Say,
 ) -> tuple[Correspondence, list[CorrespondRecord]]:
-    """Bring the scans of `jobs` that are read into correspondence by `make`, and say what a user should know of it."""
+    """Bring the scans of `jobs` that are read into correspondence by `make`, and print the messages for the user."""
     for name, reason in read.unread.items():
         say(f"{name} is excluded: {reason.removeprefix(_BROKEN)}")
     if read.unread:
@@ -195,7 +195,7 @@ def bring(
     noted = [replace(scan, notes=tuple(read.notes.get(scan.name, ()))).noting(*scan.notes) for scan in scans]
     made = replace(made, scans=tuple(noted))
     size = rms_size(made.template.vertices)
-    records = [_record(job, scan, read, results.path, size) for job, scan in zip(jobs, made.scans, strict=True)]
+    records = [_make_record(job, scan, read, results.path, size) for job, scan in zip(jobs, made.scans, strict=True)]
     for sentence in made.notes:
         say(sentence)
     report_landmarks(records, read, say)
@@ -244,7 +244,7 @@ def inputs_hash_of(
 ) -> str:
     """Return the SHA-256 of all inputs of a run, without parsing the scans; it does not depend on the executor.
 
-    `change` is what is changed in a finished correspondence.
+    `change` is the changes of a finished correspondence.
     """
 
     def landmarks_hash(scan: Path, own: Path | None) -> str:
@@ -304,7 +304,7 @@ class RoundsWithProgress:
 
 @dataclass(frozen=True)
 class ScansRead:
-    """By the names of the scans: what they hold, what is to be known of them, their hashes, and why others are not."""
+    """Content, notes and hashes of the scans that were read, and the reasons of the others, by name."""
 
     scans: dict[str, Mesh] = field(default_factory=dict[str, Mesh])
     notes: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
@@ -361,13 +361,15 @@ def report_landmarks(records: Sequence[CorrespondRecord], read: ScansRead, say: 
         f"{scan})"
     )
     off = [
-        one.landmark_rms / rms_size(read.scans[one.name].vertices) for one in records if one.landmark_rms is not None
+        record.landmark_rms / rms_size(read.scans[record.name].vertices)
+        for record in records
+        if record.landmark_rms is not None
     ]
     after = f"; from their places on the corresponding surfaces {100 * np.mean(off):.2g} % (RMS)" if off else ""
     say(f"{sentence}{after}.")
 
 
-def _record(job: Job, scan: Corresponding, read: ScansRead, folder: Path, mean_size: float) -> CorrespondRecord:
+def _make_record(job: Job, scan: Corresponding, read: ScansRead, folder: Path, mean_size: float) -> CorrespondRecord:
     """Return the record of a scan; `mean_size` is the RMS size of the mean shape."""
     source = job.source(folder)
     record = CorrespondRecord(
@@ -390,10 +392,10 @@ def _record(job: Job, scan: Corresponding, read: ScansRead, folder: Path, mean_s
 
 @dataclass(frozen=True)
 class CorrespondenceFolder:
-    """The output folder of a correspondence: what is in it, and what a run writes into it, all or nothing.
+    """The output folder of a correspondence: its content, and the files that a run writes into it, all or nothing.
 
     Args:
-        path: of the folder.
+        path: path of the folder.
     """
 
     path: Path
@@ -424,7 +426,7 @@ class CorrespondenceFolder:
     def finished(
         self, inputs_hash: str, names: Sequence[str]
     ) -> tuple[CorrespondenceRecord, list[CorrespondRecord]] | None:
-        """Return summary and records of a finished run with the same inputs whose files are whole; else None."""
+        """Return summary and records of a finished run with the same inputs whose files are intact; else None."""
         try:
             summary, records = self.read()
             is_same = summary.inputs_hash == inputs_hash and summary.results_hash == self.hash_of(summary)
@@ -480,7 +482,7 @@ class CorrespondenceFolder:
         return summary
 
     def _complete_change(self) -> None:
-        """Move the files of a change into the folder if all are written; otherwise remove what was written of them.
+        """Move the files of a change into the folder if all are written; otherwise remove those that were written.
 
         A folder that is left in between has no summary, so that nothing takes it; this function then completes it.
 

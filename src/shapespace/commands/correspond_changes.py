@@ -1,6 +1,6 @@
 """Changes of a finished correspondence: scans are added, registered again or removed, and all others stay bit for bit.
 
-With an update one more round over all scans follows, which computes the mean and all surfaces anew.
+With an update one more round over all scans follows, which computes the mean and all surfaces again.
 """
 
 from __future__ import annotations
@@ -60,13 +60,13 @@ _LISTED = 5  # names in a message, so that it stays short
 
 @dataclass(frozen=True)
 class Change:
-    """What is changed in a finished correspondence; `add`, `redo` and `remove` exclude each other.
+    """Changes of a finished correspondence; `add`, `redo` and `remove` exclude each other.
 
     Args:
         add: add the given scans to the finished correspondence in the output folder; all others stay as they are.
         redo: register this scan of the output folder again, from its file as it is now, or from the given scans.
         remove: remove the results of this scan from the output folder.
-        update: also compute the mean and all surfaces anew, by one more round over all scans.
+        update: also compute the mean and all surfaces again, by one more round over all scans.
     """
 
     add: bool = False
@@ -79,20 +79,20 @@ class Change:
 
     @property
     def option(self) -> str:
-        """The option that asks for it."""
+        """The option that requests the change."""
         return "--add" if self.add else "--redo" if self.redo else "--remove" if self.remove else "--update"
 
 
 @dataclass(frozen=True)
-class _Finished:
+class _FinishedFolder:
     """A finished correspondence in a folder.
 
     Args:
         results: the folder.
-        summary: of the run.
-        records: of all scans by name, those in correspondence first.
-        mean: its mean shape.
-        surfaces: of the scans in correspondence, by name; those of mirrored scans are reflected.
+        summary: summary of the run.
+        records: records of all scans by name, those in correspondence first.
+        mean: mean shape.
+        surfaces: surfaces of the scans in correspondence, by name; those of mirrored scans are reflected.
     """
 
     results: CorrespondenceFolder
@@ -102,7 +102,7 @@ class _Finished:
     surfaces: dict[str, Mesh]
 
     @staticmethod
-    def of(results: CorrespondenceFolder) -> _Finished:
+    def of(results: CorrespondenceFolder) -> _FinishedFolder:
         """Read all files of a correspondence.
 
         Raises:
@@ -112,17 +112,19 @@ class _Finished:
         folder, (summary, records) = results.path, results.read()
         mean = read_mesh(folder / MEAN)
         files = {name: read_mesh(folder / f"{name}{SURFACE}") for name in summary.corresponding}
-        surfaces = {name: mirror_image(one) if name in summary.mirrored else one for name, one in files.items()}
+        surfaces = {name: mirror_image(mesh) if name in summary.mirrored else mesh for name, mesh in files.items()}
         fault = ""
         if len(mean.vertices) != summary.vertices:
             fault = f"{MEAN} has {len(mean.vertices)} vertices, and the correspondence {summary.vertices}"
-        elif other := [name for name, one in surfaces.items() if not np.array_equal(faces_of(one), faces_of(mean))]:
+        elif other := [
+            name for name, surface in surfaces.items() if not np.array_equal(faces_of(surface), faces_of(mean))
+        ]:
             fault = f"{other[0]}{SURFACE} and {MEAN} have different triangles, so one of them was changed"
         elif summary.results_hash not in ("", results.hash_of(summary)):
             fault = "its files were changed after the correspondence"
         if fault:
             raise InputError(f"{folder}: {fault}; {CORRESPOND_AGAIN}.")
-        return _Finished(results, summary, records, mean, surfaces)
+        return _FinishedFolder(results, summary, records, mean, surfaces)
 
     def config(self, files: CorrespondFiles, asked: CorrespondConfig) -> CorrespondConfig:
         """Return the settings of the correspondence, which `asked` must not contradict.
@@ -148,8 +150,8 @@ class _Finished:
                 )
         return config
 
-    def refuse_unknown(self, names: Sequence[str], option: str) -> None:
-        """Raise InputError where no scan of the correspondence has one of `names`."""
+    def check_names(self, names: Sequence[str], option: str) -> None:
+        """Raise InputError if no scan of the correspondence has one of `names`."""
         for name in names:
             if name not in self.records:
                 known = first_names(list(self.records), _LISTED)
@@ -169,7 +171,7 @@ def change_correspondence(
 ) -> tuple[CorrespondenceRecord, list[CorrespondRecord]]:
     """Change the finished correspondence in `folder`, and return its summary and all records.
 
-    What was done is kept in the folder until the end, so the same command goes on from there after an interruption.
+    Finished work stays in the folder until the end, so the same command continues from there after an interruption.
 
     Raises:
         FileError: something cannot be read or written.
@@ -181,37 +183,39 @@ def change_correspondence(
             f"without {change.option} first."
         )
     with CorrespondenceFolder(folder).writing() as results:
-        finished = _Finished.of(results)
+        finished = _FinishedFolder.of(results)
         config, summary = finished.config(files, config), finished.summary
         marks = LandmarkFiles.of(files.landmarks)
         for record in finished.records.values():
-            marks.of_scan(Path(record.path))  # so that it is not said to belong to no scan
+            marks.of_scan(Path(record.path))  # so that it is not reported as unused
         given = find_jobs(files, folder, say) if files.scans else []
         new = _new_jobs(finished, change, given)
         kept = [name for name in summary.corresponding if name not in (*change.redo, *change.remove)]
         old = _old_jobs(finished, change, given) if change.update else []
         jobs = list({job.name: job for job in (*old, *new)}.values())
-        marks.refuse_shared([job.scan for job in jobs if job.landmarks is None])
+        marks.check_not_shared([job.scan for job in jobs if job.landmarks is None])
         what = [change.option, sorted({*change.redo, *change.remove}), change.update]
         inputs_hash = inputs_hash_of(sorted(jobs, key=lambda job: job.name), marks, files, config, what)
         if inputs_hash == summary.inputs_hash or not (new or change.remove or change.update):
             say(f"{folder} already contains the results of this command; nothing is computed.")
             return summary, list(finished.records.values())
-        finished.refuse_unknown(change.remove, "--remove")
+        finished.check_names(change.remove, "--remove")
         if len(kept) < (1 if new else FEWEST):
             raise InputError(
                 f"{change.option} leaves {len(kept)} of the scans in {folder} as they are, which are too few; run "
                 "shapespace correspond on all scans instead."
             )
         read = read_scans(jobs, marks, strict=files.strict, outer=config.outer, quiet=quiet, say=say)
-        _refuse_changed(finished, read, files, kept if change.update else [])
+        _check_unchanged(finished, read, files, kept if change.update else [])
         first = {finished.records[name].hash: name for name in kept if name not in read.scans}
         for name, content_hash in read.hashes.items():
             if name in read.notes and content_hash in first:
                 read.notes[name].append(f"It is {first[content_hash]} again; leave one of them out.")
 
         def make(rounds: RoundsWithProgress) -> Correspondence:
-            return _registered(finished, kept, read, marks, replace(config, outer=False), rounds, update=change.update)
+            return _register_scans(
+                finished, kept, read, marks, replace(config, outer=False), rounds, update=change.update
+            )
 
         made, records = bring(jobs, read, marks, files, finished.results, make, quiet=quiet, say=say)
         every = {name: record for name, record in finished.records.items() if name not in change.remove}
@@ -231,11 +235,11 @@ def change_correspondence(
 # Which scans
 
 
-def _new_jobs(finished: _Finished, change: Change, given: Sequence[Job]) -> list[Job]:
+def _new_jobs(finished: _FinishedFolder, change: Change, given: Sequence[Job]) -> list[Job]:
     """Return the scans that are registered to the mean: new ones, or those that are registered again."""
     if change.add:
-        return _not_there(finished, given)
-    finished.refuse_unknown(change.redo, "--redo")
+        return _jobs_to_add(finished, given)
+    finished.check_names(change.redo, "--redo")
     if given and not (change.redo or change.update):
         raise InputError("--remove takes the names of scans, and no files; leave the files out.")
     by_name = {job.name: job for job in given}
@@ -244,7 +248,7 @@ def _new_jobs(finished: _Finished, change: Change, given: Sequence[Job]) -> list
     return [by_name.get(name) or finished.job(name) for name in dict.fromkeys(change.redo)]
 
 
-def _not_there(finished: _Finished, given: Sequence[Job]) -> list[Job]:
+def _jobs_to_add(finished: _FinishedFolder, given: Sequence[Job]) -> list[Job]:
     """Return the `given` scans that the correspondence does not have yet; it has no others of the same names."""
     if not given:
         raise InputError("--add needs scans; give their files or folders.")
@@ -258,15 +262,15 @@ def _not_there(finished: _Finished, given: Sequence[Job]) -> list[Job]:
     return [job for job in given if job.name not in finished.records]
 
 
-def _old_jobs(finished: _Finished, change: Change, given: Sequence[Job]) -> list[Job]:
+def _old_jobs(finished: _FinishedFolder, change: Change, given: Sequence[Job]) -> list[Job]:
     """Return the scans of the correspondence that stay in it, from the `given` scans or from where they were."""
     moved = {} if change.add else {job.name: job for job in given}
     names = [name for name in finished.records if name not in (*change.redo, *change.remove)]
     return [moved.get(name) or finished.job(name) for name in names]
 
 
-def _refuse_changed(finished: _Finished, read: ScansRead, files: CorrespondFiles, kept: Sequence[str]) -> None:
-    """Raise InputError where a scan of `kept` is not as it was, or where a scan had landmarks that are not given."""
+def _check_unchanged(finished: _FinishedFolder, read: ScansRead, files: CorrespondFiles, kept: Sequence[str]) -> None:
+    """Raise InputError if a scan of `kept` has changed, or if a scan had landmarks that are not given."""
     for name in kept:
         record = finished.records[name]
         if name in read.unread:
@@ -282,8 +286,8 @@ def _refuse_changed(finished: _Finished, read: ScansRead, files: CorrespondFiles
 # Their registration
 
 
-def _registered(
-    finished: _Finished,
+def _register_scans(
+    finished: _FinishedFolder,
     kept: Sequence[str],
     read: ScansRead,
     marks: LandmarkFiles,
@@ -306,13 +310,13 @@ def _registered(
     mirrored = [name in finished.summary.mirrored for name in kept]
     start = FinishedCorrespondence(
         finished.mean, landmarks, surfaces, raw, mirrored, finished.summary.sides_decided,
-        judged=[] if update else [_judged(finished, name) for name in kept],
+        judged=[] if update else [_registration_of_record(finished, name) for name in kept],
     )  # fmt: skip
     return add_scans(start, added, config, run=rounds)
 
 
-def _judged(finished: _Finished, name: str) -> Corresponding:
-    """Return what is known of a scan that stays."""
+def _registration_of_record(finished: _FinishedFolder, name: str) -> Corresponding:
+    """Return the registration of a scan that stays, from its record."""
     record, surface, mean = finished.records[name], finished.surfaces[name], finished.mean.vertices
     observed = np.ones(len(mean), np.bool_) if surface.observed is None else surface.observed
     T = fit_similarity(mean[observed], surface.vertices[observed])
@@ -327,7 +331,7 @@ def _judged(finished: _Finished, name: str) -> Corresponding:
 
 
 def _summary(
-    finished: _Finished,
+    finished: _FinishedFolder,
     change: Change,
     records: Sequence[CorrespondRecord],
     every: Mapping[str, CorrespondRecord],
@@ -368,14 +372,14 @@ def correspond(
     """Bring scans into correspondence, or change a finished correspondence.
 
     Args:
-        scans: files, folders, patterns, addresses and lists of these.
-        output: where results go, or the finished correspondence.
+        scans: files, folders, patterns, addresses and lists of scans.
+        output: folder of the results, or of the finished correspondence.
         config: settings.
-        change: what is changed.
+        change: changes of the finished correspondence.
         execution: Executor of the registrations.
-        template: see `CorrespondFiles`, as for the following.
-        model: to begin with.
-        landmarks: a folder of files that are named as the scans.
+        template: mesh of the first template, or None.
+        model: model of the first template, or None.
+        landmarks: folder of landmark files that are named as the scans, or None.
         subjects: column of the list of scans.
         groups: bring each kind of object into correspondence.
         recursive: take scans in folders below those given too.
@@ -385,7 +389,7 @@ def correspond(
 
     Raises:
         FileError: something cannot be read or written.
-        InputError: options that do not go together, or too few scans.
+        InputError: options that exclude each other, or too few scans.
     """
     if change and groups:
         raise InputError(f"--groups cannot be combined with {change.option}; leave one of them out.")

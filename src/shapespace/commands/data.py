@@ -1,4 +1,4 @@
-"""What `data` does: open data sets, and simulated faces and organs."""
+"""Command `data`: open data sets, and simulated faces and organs."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def data_get(name: str, to: Path | None, *, quiet: bool) -> Outcome:
     return Outcome({"folder": folder}, [folder])
 
 
-def _written(folder: Path, noun: str, count: int, provenance: str, licence: str = "") -> Outcome:
-    """Write what the simulated shapes in a folder are, and return how many there are; empty: our licence."""
+def _write_about(folder: Path, noun: str, count: int, provenance: str, licence: str = "") -> Outcome:
+    """Write the provenance of the simulated shapes in a folder, and return their number; an empty licence is ours."""
     from shapespace.datasets.faces import LICENSE
 
     write_about(folder, provenance, licence or LICENSE)
@@ -53,7 +53,7 @@ def write_simulated_faces(
     intensities: Sequence[float] = (1.0,),
     effect_mm: float | None = None,
 ) -> Outcome:
-    """Write corresponded faces of the bundled or of the ICT generator, or raw scans of them.
+    """Write corresponded faces of the bundled or of the ICT generator, or raw scans of such faces.
 
     Args:
         output: output folder.
@@ -70,7 +70,7 @@ def write_simulated_faces(
         effect_mm: also write a sex and an age into labels.csv, and move the chin of men forward by this length, mm.
 
     Raises:
-        InputError: an unknown expression or area, intensities that cannot be, or wide people or an effect of
+        InputError: an unknown expression or area, impossible intensities, or wide people or an effect of
             ICT-FaceKit.
         DataError: ICT-FaceKit is asked for and absent.
         FileError: the folder cannot be written.
@@ -102,7 +102,7 @@ def write_simulated_faces(
     licence, of = ("MIT", f"ICT-FaceKit, area {area or 'face'}") if source == "ict-facekit" else ("", "shapespace")
     who = "people who vary widely" if wide else "people"
     description = f"{subjects} simulated {who} of {of}, seed {seed}, expressions: {', '.join(expressions)}"
-    return _written(output, "face", total, description, licence)
+    return _write_about(output, "face", total, description, licence)
 
 
 def write_simulated_bones(
@@ -125,7 +125,7 @@ def write_simulated_bones(
 
     with progress(count, "writing", "bone", quiet=quiet) as bar:
         write_bones(output, count=count, seed=seed, effect_mm=effect_mm, progress=bar.update)
-    return _written(output, "bone", count, f"{count} simulated bones of shapespace in two groups, seed {seed}")
+    return _write_about(output, "bone", count, f"{count} simulated bones of shapespace in two groups, seed {seed}")
 
 
 def write_simulated_landmarks(output: Path, *, count: int = 40, seed: int = 0) -> Outcome:
@@ -143,7 +143,7 @@ def write_simulated_landmarks(output: Path, *, count: int = 40, seed: int = 0) -
     from shapespace.datasets.skull_landmarks import write_skull_landmarks
 
     write_skull_landmarks(output, count=count, seed=seed)
-    return _written(output, "skull", count, f"landmarks of {count} simulated skulls of shapespace, seed {seed}")
+    return _write_about(output, "skull", count, f"landmarks of {count} simulated skulls of shapespace, seed {seed}")
 
 
 def write_simulated_organs(
@@ -167,4 +167,4 @@ def write_simulated_organs(
 
     with progress(count, "writing", "organ", quiet=quiet) as bar:
         write_organs(output, count=count, seed=seed, volumes=volumes, progress=bar.update)
-    return _written(output, "organ", count, f"{count} simulated organs of shapespace, seed {seed}")
+    return _write_about(output, "organ", count, f"{count} simulated organs of shapespace, seed {seed}")

@@ -1,4 +1,4 @@
-"""What `demo` does: both experiments of the paper, ending in a report."""
+"""Command `demo`: both experiments of the paper, ending in a report."""
 
 from __future__ import annotations
 

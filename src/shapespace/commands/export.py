@@ -1,4 +1,4 @@
-"""What `export` does: fits of a store as single files or as one table, and cohorts as files of other programs."""
+"""Command `export`: fits of a store as single files or as one table, and cohorts as files of other programs."""
 
 from __future__ import annotations
 
@@ -51,18 +51,18 @@ def export(
     Records and landmarks are the same to the byte, surfaces to a 16-millionth of their half extent (float32).
 
     Args:
-        folder: that `shapespace fit` wrote, with a store or without.
-        names: of the fits.
+        folder: folder that `shapespace fit` wrote, with or without a store.
+        names: names of the fits.
         output: folder to write them to.
         every: export all fits.
         table: write the coefficients of all fits to this file: FILE.csv, or FILE.mat for MATLAB.
         quiet: no progress.
-        say: called with what cannot be read; the rest is written.
+        say: called with a message on each fit that cannot be read; the others are written.
 
     Raises:
         FileError: something cannot be written.
         FileFormatError: the manifest is damaged.
-        InputError: a name that there is not, nothing asked for, or `output` is the folder itself.
+        InputError: a name that does not exist, nothing to export, or `output` is the folder itself.
     """
     results = Results(folder)
     if not (names or every or table):
@@ -78,7 +78,7 @@ def export(
     with progress(len(wanted), "exporting", "fit", quiet=quiet) as bar:
         for name in wanted:
             try:
-                _write(results, name, output)
+                _write_fit(results, name, output)
             except ShapespaceError as error:
                 failed.append(name)
                 say(str(error))
@@ -94,8 +94,8 @@ def export(
     return Outcome(facts, lines, exit_code=exit_code_of(len(failed), len(wanted)))
 
 
-def _write(results: Results, name: str, output: Path) -> None:
-    # The record comes last, as in a fit: what lies there with a record is whole.
+def _write_fit(results: Results, name: str, output: Path) -> None:
+    # The record comes last, as in a fit, so that results with a record are complete.
     for kind, ending in ENDINGS.items():
         path = output / f"{name}{ending}"
         if kind == "stages" and results.has(name, kind):
@@ -130,8 +130,8 @@ def write_table(results: Results, path: Path) -> None:
 def write_mat(results: Results, path: Path) -> None:
     """Write the coefficients of all fits for MATLAB and Octave, as the struct `fits` of a MAT-file of level 5.
 
-    `b`, `z` and `b_stddev` are (N, K); other columns of coefficients.csv are (N, 1), texts as cells; what is not known
-    is NaN, and what a name of MATLAB cannot hold is an underscore.
+    `b`, `z` and `b_stddev` are (N, K); other columns of coefficients.csv are (N, 1), texts as cells. Unknown numbers
+    are NaN, and characters that MATLAB does not allow in names are underscores.
 
     Raises:
         FileError: it cannot be written.
@@ -190,10 +190,10 @@ def export_cohort(cohort: Cohort, output: Path, to: Target, formula: str | None 
     `geomorph` is a folder with coordinates, covariates, and a script in R of the linear model `formula`.
 
     Args:
-        cohort: its coordinates are written as they are compared: aligned, and in the tangent space in the gauge shape.
+        cohort: cohort with coordinates as they are compared: aligned, and in the tangent space in the gauge shape.
         output: the file; a folder for geomorph, or to write landmarks.ENDING into.
         to: geomorph (a folder with a script in R), morphoj, tps or csv (default: fits of DATA as files)
-        formula: for geomorph, linear model of shape, such as '~ sex + age' (default: the mean alone)
+        formula: linear model of shape for geomorph, such as '~ sex + age' (default: the mean alone)
 
     Raises:
         InputError: a formula that cannot be read, or missing values in its columns.
@@ -213,7 +213,7 @@ def export_cohort(cohort: Cohort, output: Path, to: Target, formula: str | None 
         ending = CONFIGURATION_FORMATS[to]
         if output.suffix.lower() != ending:
             output = make_folder(output) / f"landmarks{ending}"
-        return _exported(given, [output], [*notes, *write_configurations(output, configurations, to)])
+        return _export_outcome(given, [output], [*notes, *write_configurations(output, configurations, to)])
     make_folder(output)
     write_configurations(output / COORDINATES, replace(configurations, columns={}), "csv")
     table = zip(cohort.names, *columns.values(), strict=True)
@@ -222,17 +222,17 @@ def export_cohort(cohort: Cohort, output: Path, to: Target, formula: str | None 
     write_text(output / R_SCRIPT, _R.replace("@FORMULA", model).replace("@K", str(cohort.dimensions)))
     if cohort.position_std is not None:
         notes.append("The script gives all vertices the same weight, as compare does with --set weights=none.")
-    return _exported(given, [output / name for name in (COORDINATES, COVARIATES, R_SCRIPT)], notes)
+    return _export_outcome(given, [output / name for name in (COORDINATES, COVARIATES, R_SCRIPT)], notes)
 
 
-def _exported(cohort: Cohort, files: Sequence[Path], notes: Sequence[str]) -> Outcome:
+def _export_outcome(cohort: Cohort, files: Sequence[Path], notes: Sequence[str]) -> Outcome:
     facts = {"files": [str(file) for file in files], "shapes": len(cohort), "notes": notes}
     lines = [f"{len(cohort)} shapes in {', '.join(map(str, files))}"]
     return Outcome(facts, lines, [*cohort.notes, *notes])
 
 
 _R = """\
-# Linear model of the exported shapes: by procD.lm where geomorph is installed, and its sums of squares in R alone.
+# Linear model of the exported shapes: by procD.lm if geomorph is installed, and its sums of squares in R alone.
 model <- coords ~ @FORMULA
 ss_type <- "II"  # type of the sums of squares: "I", "II" or "III"
 covariates <- read.csv("covariates.csv", check.names = FALSE, stringsAsFactors = TRUE, na.strings = "")

@@ -1,4 +1,4 @@
-"""What `fit` does: a model and scans in files to result files in a folder."""
+"""Command `fit`: a model and scans in files to result files in a folder."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from shapespace.schemas import FitRecord, OverlapDistances
 from shapespace.store.manifest import read_manifest
 
 FULL_CHECK_BYTES = 2**28
-"""Scans of so many bytes together are read whole before the first fit (256 MiB: 0.4 s of binary PLY, 14 s of OBJ)."""
+"""Total size of scans up to which all are read before the first fit (256 MiB: 0.4 s of binary PLY, 14 s of OBJ)."""
 _STATUSES = ("converged", "max_iterations", "doubtful", "failed")
 _SURFACES = (".fitted.ply", ".dense.ply")
 
@@ -64,23 +64,23 @@ def fit(
     """Fit scans into a folder; of a store, only counts are returned.
 
     Args:
-        model: the model's file.
+        model: file of the model.
         scans: files, folders, patterns, addresses and lists, as `given_scans` takes them.
-        output: where results go.
+        output: folder of the results.
         config: settings of each fit, except method and region.
         execution: Executor of the fits.
         method: name of the method.
         search: closest points of the method paper; `auto` for the default of the method.
-        region: name of a region of the model, or file of its vertices; None for the whole model.
-        landmarks: a file of the one scan there is, or a folder with a file for each, named as the scans; None where
-            there are none, or a list of scans names them.
-        again: fit also scans whose results still hold.
+        region: name of a region of the model, or file of its vertices; None for the complete model.
+        landmarks: file of the only scan, or folder with a file for each scan, named as the scans; None without
+            landmarks, or if a list of scans names the files.
+        again: fit also scans whose results are still valid.
         stages: also write the surfaces at each stage.
         recursive: take scans in folders below those given too.
-        store: keep results in a store, as is done from `STORE_FROM` scans on, and where there is one.
+        store: keep results in a store, as for `STORE_FROM` scans or more, and if there is a store.
         strict: whether a doubtful fit makes the exit code 1.
         quiet: no progress.
-        say: called with what was not taken, and of each scan whose fit did not converge.
+        say: called with messages on skipped files and on each fit that did not converge.
 
     Raises:
         FileError: the model cannot be read, or the results not written.
@@ -91,7 +91,7 @@ def fit(
         method=method_named(method, **({} if search == "auto" else {"search": search})),
         region=read_region(region) if region is not None and Path(region).is_file() else region,
     )
-    given = _scans(scans, output, recursive=recursive, say=say)
+    given = _scans_to_fit(scans, output, recursive=recursive, say=say)
     one, many = landmark_files(landmarks, len(given))
     loaded = ShapeModel.load(model)
     make_folder(output)
@@ -147,7 +147,7 @@ def _lines(records: Mapping[str, FitRecord], counts: Mapping[str, int], folder: 
 def _fit_lines(named: tuple[str, FitRecord]) -> list[str]:
     name, record = named
     file = record.scan.name
-    # A scan that shares its file's name with others goes by the name of its results.
+    # A scan that shares its file's name with others is named by its results.
     called = file if stem_of(file) == name else f"{name} ({file})"
     distances, dense = _distances(record.shown), _distances(record.shown_dense, measure="median")
     return [
@@ -211,7 +211,7 @@ def _write_list(folder: Path, jobs: Sequence[Job]) -> None:
 
 @dataclass(frozen=True)
 class _Watch:
-    """Shows how the fits go, and says which did not converge."""
+    """Shows the progress of the fits, and prints which did not converge."""
 
     bar: tqdm[Any]
     say: Callable[[str], None]
@@ -224,7 +224,7 @@ class _Watch:
             count_text = "1 scan has" if len(self.removed) == 1 else f"{len(self.removed)} scans have"
             self.say(
                 f"{count_text} vertices with {NON_FINITE}, which were removed with their triangles ({named}); --strict "
-                "refuses such scans."
+                "rejects such scans."
             )
 
     def state(self, state: IcpState) -> None:
@@ -250,8 +250,8 @@ class _Watch:
 def find_suspects(jobs: Sequence[Job], *, quiet: bool) -> set[str]:
     """Return the names of jobs whose scans probably cannot be read, so that they are done, and reported, first.
 
-    Scans of up to `FULL_CHECK_BYTES` together are read whole; of more, each is checked by its first 64 KiB and its
-    size. Scans at addresses are not fetched twice, and are not checked. One scan alone is not checked.
+    Scans of up to `FULL_CHECK_BYTES` together are read completely; of larger sets, each scan is checked by its first
+    64 KiB and its size. Scans at addresses are not fetched twice, and are not checked. A single scan is not checked.
     """
     here = [job for job in jobs if not job.address]
     if len(jobs) < 2 or not here:
@@ -291,16 +291,16 @@ def scan_jobs(given: Sequence[Given], landmarks: Path | None, many: LandmarkFile
 
     Args:
         given: the scans.
-        landmarks: of the one scan there is.
-        many: of many scans; the columns of a list go before.
-        folder: of the results.
+        landmarks: landmark file of the only scan.
+        many: landmark files of many scans; the columns of a list have priority.
+        folder: folder of the results.
     """
-    many.refuse_shared([one.path for one in given if one.landmarks is None])
-    addresses = {one.path: one.address for one in given if one.address}
-    made = with_ids(make_jobs([one.path for one in given], landmarks, folder, addresses), given)
+    many.check_not_shared([scan.path for scan in given if scan.landmarks is None])
+    addresses = {scan.path: scan.address for scan in given if scan.address}
+    made = with_ids(make_jobs([scan.path for scan in given], landmarks, folder, addresses), given)
     jobs = [
-        replace(job, landmarks=one.landmarks or job.landmarks or many.of_scan(job.scan))
-        for job, one in zip(made, given, strict=True)
+        replace(job, landmarks=scan.landmarks or job.landmarks or many.of_scan(job.scan))
+        for job, scan in zip(made, given, strict=True)
     ]
     for job in jobs:
         written = {(folder / f"{job.name}{ending}").resolve() for ending in FIDUCIAL_ENDINGS}
@@ -309,20 +309,24 @@ def scan_jobs(given: Sequence[Given], landmarks: Path | None, many: LandmarkFile
     return jobs
 
 
-def _scans(scans: Sequence[str | Path], folder: Path, *, recursive: bool, say: Callable[[str], None]) -> list[Given]:
-    """Return the files to fit: without the surfaces that earlier runs left, where scans and results mix."""
+def _scans_to_fit(
+    scans: Sequence[str | Path], folder: Path, *, recursive: bool, say: Callable[[str], None]
+) -> list[Given]:
+    """Return the files to fit: without the surfaces that earlier runs left, if scans and results are in one folder."""
     scans_found = given_scans(scans, folder, recursive=recursive, say=say)
     here = folder.resolve()
-    given = {Path(one).resolve() for one in scans if not is_address(str(one))}
+    given = {Path(scan).resolve() for scan in scans if not is_address(str(scan))}
 
     def is_result(scan: Path | str) -> bool:
         if isinstance(scan, str) or not is_of_fit(scan, _SURFACES):
             return False
         return scan.parent.resolve() == here or not {scan.resolve(), scan.parent.resolve()} & given
 
-    left = [one for one in scans_found if not is_result(one.source)]
+    left = [scan for scan in scans_found if not is_result(scan.source)]
     if not left:
-        raise InputError(f"{folder} holds only results of earlier fits; give the scans, or another folder for results.")
+        raise InputError(
+            f"{folder} contains only results of earlier fits; give the scans, or another folder for results."
+        )
     if len(left) < len(scans_found):
         results = len(scans_found) - len(left)
         count_text = "1 surface of an earlier fit is" if results == 1 else f"{results} surfaces of earlier fits are"

@@ -1,4 +1,4 @@
-"""What a command is given: scans in files, folders, patterns, addresses and lists, and landmarks named as the scans."""
+"""Inputs of commands: scans in files, folders, patterns, addresses and lists, and landmarks named as the scans."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ class Given:
 
     Args:
         source: path of the scan, or its address.
-        called: by the column `id` of a list, or empty.
+        called: name in the column `id` of a list, or empty.
         metadata: the other columns of the list.
-        landmarks: of the scan, by the column `landmarks` of the list; None where it names none.
+        landmarks: landmark file in the column `landmarks` of the list; None if there is none.
     """
 
     source: Path | str
@@ -51,12 +51,12 @@ class Given:
 
     @property
     def address(self) -> str:
-        """Of a scan that lies elsewhere; else empty."""
+        """Address of a remote scan; empty for a local one."""
         return self.source if isinstance(self.source, str) else ""
 
     @property
     def path(self) -> Path:
-        """Of the scan; of one that lies elsewhere, what it would be, for its name."""
+        """Path of the scan; for a remote scan, a path made of its address, from which it is named."""
         if isinstance(self.source, Path):
             return self.source
         head = self.source.split("::", 1)[0].partition("?")[0]
@@ -72,39 +72,40 @@ def given_scans(
         scans: paths of scans and of folders, patterns, addresses, and lists: a text file with one of these in a line,
             or a table that `io.tables.table_rows` reads, with a column `scan`, `file`, `path`, `specimen`, `name` or
             `id`, perhaps `id` and `landmarks` as well, and others that are kept.
-        folder: of the results, not looked into.
-        recursive: whether to take what lies in folders below too.
+        folder: folder of the results, which is not searched.
+        recursive: whether to search subfolders too.
         say: called with each message on skipped files.
 
     Raises:
-        InputError: there is nothing, or a list is not one.
+        InputError: there are no scans, or a list is invalid.
         FileError: a folder, a list or an address cannot be read.
     """
     rows: list[Given] = []
-    for one in scans:
-        text = str(one)
+    for item in scans:
+        text = str(item)
         if not is_address(text) and text.lower().endswith(_LISTS) and Path(text).is_file():
-            for row in _rows(Path(text)):
-                there = _expanded(row.source, folder, recursive=recursive, say=say)
+            for row in _read_rows(Path(text)):
+                there = _expand_source(row.source, folder, recursive=recursive, say=say)
                 if row.called and len(there) > 1:
                     raise InputError(f"{text}: {row.called} stands for {len(there)} scans; give a row for each.")
                 if row.landmarks is not None and len(there) > 1:
                     raise InputError(f"{text}: the landmarks {row.landmarks} cannot be those of {len(there)} scans.")
                 rows += [replace(row, source=source) for source in there]
         else:
-            rows += [Given(source) for source in _expanded(text, folder, recursive=recursive, say=say)]
-    _refuse_doubles(rows)
+            rows += [Given(source) for source in _expand_source(text, folder, recursive=recursive, say=say)]
+    _check_ids(rows)
     return rows
 
 
 def with_ids(jobs: Sequence[Job], given: Sequence[Given]) -> list[Job]:
-    """Return `jobs` by the ids of the scans that they are of, where these have some, with what is known of the scans.
+    """Return `jobs` named by the ids of their scans, if these have ids, with the metadata of the scans.
 
     Raises:
         InputError: two scans would have one name.
     """
     named = [
-        replace(job, name=one.called or job.name, metadata=one.metadata) for job, one in zip(jobs, given, strict=True)
+        replace(job, name=scan.called or job.name, metadata=scan.metadata)
+        for job, scan in zip(jobs, given, strict=True)
     ]
     seen: dict[str, Job] = {}
     for job in named:
@@ -113,7 +114,9 @@ def with_ids(jobs: Sequence[Job], given: Sequence[Given]) -> list[Job]:
     return named
 
 
-def _expanded(text: str | Path, folder: Path, *, recursive: bool, say: Callable[[str], None]) -> Sequence[Path | str]:
+def _expand_source(
+    text: str | Path, folder: Path, *, recursive: bool, say: Callable[[str], None]
+) -> Sequence[Path | str]:
     if isinstance(text, str) and is_address(text):
         return addresses(text, MESH_FILE_ENDINGS, recursive=recursive)
     path = Path(text)
@@ -122,7 +125,7 @@ def _expanded(text: str | Path, folder: Path, *, recursive: bool, say: Callable[
         if not matched:
             raise InputError(f"No file matches {path}; check the pattern.")
         # A pattern that ends in an ending names scans; another one may take what is none.
-        files = [one for one in matched if one.is_dir() or one.name.lower().endswith(MESH_FILE_ENDINGS)]
+        files = [file for file in matched if file.is_dir() or file.name.lower().endswith(MESH_FILE_ENDINGS)]
         paths = files or matched
     else:
         if not path.name.lower().endswith(MESH_FILE_ENDINGS) and not os.path.lexists(path):
@@ -134,7 +137,7 @@ def _expanded(text: str | Path, folder: Path, *, recursive: bool, say: Callable[
     return listed.files
 
 
-def _rows(file: Path) -> list[Given]:
+def _read_rows(file: Path) -> list[Given]:
     """Return the rows of a list, with places relative to its folder."""
     check_file(file, _LARGEST_BYTES, "give a smaller list")
     try:
@@ -143,7 +146,7 @@ def _rows(file: Path) -> list[Given]:
             lines = [line.strip() for line in decoded_text(content).splitlines()]
             rows = [Given(_relative_to(file, line)) for line in lines if line and not line.startswith("#")]
         else:
-            rows = _table(file, content)
+            rows = _read_table(file, content)
     except ShapespaceError:
         raise
     except ValueError as error:
@@ -153,12 +156,12 @@ def _rows(file: Path) -> list[Given]:
     return rows
 
 
-def _table(file: Path, content: bytes) -> list[Given]:
+def _read_table(file: Path, content: bytes) -> list[Given]:
     """Return the rows of a table of scans.
 
     Raises:
         InputError: it has no column for the scans, or a row without one or with an id that no file can have.
-        ValueError: it is no table; with a clause on the fault.
+        ValueError: it is no table; the message is a clause on the fault.
     """
     lines = table_rows(content)
     header = next(lines)
@@ -186,13 +189,13 @@ def _table(file: Path, content: bytes) -> list[Given]:
 
 
 def _scan_source(file: Path, text: str) -> Path | str:
-    """Return the place of a scan, which may be named without its ending where one mesh file has that name."""
+    """Return the place of a scan, which may be named without its ending if one mesh file has that name."""
     source = _relative_to(file, text)
     if isinstance(source, str) or source.name.lower().endswith(MESH_FILE_ENDINGS) or glob.has_magic(text):
         return source
     try:
-        there = [one for one in sorted(source.parent.glob(f"{source.name}.*")) if stem_of(one) == source.name]
-        meshes = [one for one in there if one.name.lower().endswith(MESH_FILE_ENDINGS)]
+        there = [match for match in sorted(source.parent.glob(f"{source.name}.*")) if stem_of(match) == source.name]
+        meshes = [match for match in there if match.name.lower().endswith(MESH_FILE_ENDINGS)]
         return meshes[0] if len(meshes) == 1 and not source.exists() else source
     except (OSError, ValueError):
         return source  # the reader of the scans reports such a name
@@ -202,15 +205,15 @@ def _relative_to(file: Path, text: str) -> Path | str:
     return text if is_address(text) else file.parent / text
 
 
-def _refuse_doubles(scans: Sequence[Given]) -> None:
+def _check_ids(scans: Sequence[Given]) -> None:
     named: dict[str, Given] = {}
-    for one in scans:
-        if one.called and named.setdefault(one.called.casefold(), one).source != one.source:
-            raise InputError(f"Two scans have the id {one.called}; give each one of its own.")
+    for scan in scans:
+        if scan.called and named.setdefault(scan.called.casefold(), scan).source != scan.source:
+            raise InputError(f"Two scans have the id {scan.called}; give each one of its own.")
 
 
 def is_of_fit(file: Path, endings: Sequence[str]) -> bool:
-    """Return whether a fit wrote `file`, which has one of `endings`, beside its record."""
+    """Return whether a fit wrote `file`, which has one of `endings` and lies next to its record."""
     names = [file.name.removesuffix(ending) for ending in endings if file.name.endswith(ending)]
     return any(file.with_name(f"{name}{RECORD}").is_file() for name in names)
 
@@ -220,10 +223,10 @@ class LandmarkFiles:
     """The landmark files of a folder.
 
     Args:
-        folder: where they are; None where there are none.
+        folder: folder of the files; None without files.
         files: name of a scan without its ending -> file.
         used: names that a scan had.
-        unread: what is to be said of files that cannot be used.
+        unread: messages on files that cannot be used.
         duplicates: name of a scan -> further files with its landmarks.
     """
 
@@ -238,7 +241,7 @@ class LandmarkFiles:
         """Return the landmark files in `folder`.
 
         Raises:
-            FileError: it is no folder, or holds no such file.
+            FileError: it is no folder, or contains no such file.
         """
         if folder is None:
             return LandmarkFiles(None)
@@ -249,7 +252,7 @@ class LandmarkFiles:
         unread: list[str] = []
         duplicates: dict[str, list[Path]] = {}
         for file in sorted(folder.iterdir()):
-            ending = next((one for one in endings if file.name.lower().endswith(one)), None)
+            ending = next((suffix for suffix in endings if file.name.lower().endswith(suffix)), None)
             if ending is None or not file.is_file() or is_of_fit(file, FIDUCIAL_ENDINGS):
                 continue
             first = files.setdefault(file.name[: -len(ending)], file)
@@ -257,11 +260,11 @@ class LandmarkFiles:
                 duplicates.setdefault(file.name[: -len(ending)], []).append(file)
                 unread.append(f"{file.name} is not read, since {first.name} has landmarks of the same scan.")
         if not files:
-            raise FileError(f"{folder} holds no landmarks; they are read from files with {', '.join(endings)}.")
+            raise FileError(f"{folder} contains no landmarks; they are read from files with {', '.join(endings)}.")
         return LandmarkFiles(folder, files, unread=unread, duplicates=duplicates)
 
-    def refuse_shared(self, scans: Sequence[Path]) -> None:
-        """Raise InputError where two of `scans`, of one name in different folders, would take the same landmarks."""
+    def check_not_shared(self, scans: Sequence[Path]) -> None:
+        """Raise InputError if two of `scans`, of one name in different folders, would take the same landmarks."""
         owner: dict[str, Path] = {}
         for path in scans:
             name = stem_of(path)
@@ -272,7 +275,7 @@ class LandmarkFiles:
                 )
 
     def of_scan(self, scan: Path) -> Path | None:
-        """Return the file with the landmarks of `scan`, None where there is none."""
+        """Return the file with the landmarks of `scan`, None if there is none."""
         file = self.files.get(stem_of(scan))
         if file is not None:
             self.used.add(stem_of(scan))
@@ -286,11 +289,11 @@ class LandmarkFiles:
         try:
             return replace(mesh, landmarks=read_landmarks(file))
         except ShapespaceError as error:
-            self.unread.append(f"{path.name} goes without landmarks: {error}")
+            self.unread.append(f"{path.name} is used without landmarks: {error}")
             return mesh
 
     def report_unused(self, say: Callable[[str], None]) -> None:
-        """Print which files belong to no scan.
+        """Print the files that belong to no scan.
 
         Raises:
             InputError: all files belong to none.
@@ -314,16 +317,16 @@ class SurfacesOnDisk:
     """Meshes in correspondence, in mm, on one side, without estimates, each read when it is asked for.
 
     Args:
-        files: of the meshes.
-        listed: reads them.
-        unit: of most.
-        without_vertices: what to do about a mesh that has none, for a message.
+        files: files of the meshes.
+        listed: reader of the files.
+        unit: unit of most meshes.
+        without_vertices: end of the message on a mesh without vertices.
     """
 
     files: Sequence[Path]
     listed: SurfaceFiles
     unit: str = "mm"
-    without_vertices: str = "; leave it out"
+    without_vertices: str = "; omit it"
 
     def __len__(self) -> int:
         return len(self.files)

@@ -1,4 +1,4 @@
-"""What `landmarks convert`, `check` and `plot` do with the landmarks of many specimens."""
+"""Commands `landmarks convert`, `check` and `plot`, for the landmarks of many specimens."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def convert_landmarks(
     curve_points: int | None = None,
     dimensions: int | None = None,
 ) -> Outcome:
-    """Write the landmarks of many specimens in another format, and say what changed.
+    """Write the landmarks of many specimens in another format, and note the changes.
 
     Sliders are written next to the output as OUT.curveslide.csv and OUT.surfslide.csv.
 
@@ -53,7 +53,7 @@ def convert_landmarks(
 
     Raises:
         FileError: something cannot be read or written.
-        InputError: an unknown format, or one that cannot hold the landmarks.
+        InputError: an unknown format, or one that cannot store the landmarks.
     """
     if data.resolve() == output.resolve():
         raise InputError(f"{output} is the file to convert; give another name to write to.")
@@ -77,7 +77,7 @@ def check_landmarks(
     sliders: Sequence[Path] = (),
     say: Callable[[str], None],
 ) -> Outcome:
-    """Say what landmark data contain: counts, missing landmarks, and `findings`, a sentence each.
+    """Return the content of landmark data: counts, missing landmarks, and `findings`, a sentence each.
 
     Findings are duplicates, specimens of another scale, mirrored specimens, swapped landmarks, and outliers. With
     scans in correspondence the landmarks are compared with their predictions.
@@ -132,15 +132,15 @@ def _duplicates(raw: LandmarkConfigurations) -> list[str]:
     for name, points in zip(raw.names, raw.points, strict=True):
         other = first.setdefault(points.tobytes(), name)
         if other != name:
-            findings.append(f"{name} has the same coordinates as {other}; remove one of them.")
+            findings.append(f"{name} has the same coordinates as {other}; remove one of the specimens.")
         place: dict[tuple[float, ...], str] = {}
         for label, point in zip(raw.landmarks, points.tolist(), strict=True):
             # Missing landmarks differ, since not-a-number does not equal itself.
             before = place.setdefault(tuple(point), label)
             together[before, label] += before != label
-    for (one, two), count in together.most_common():
+    for (earlier, later), count in together.most_common():
         if count:
-            findings.append(f"Landmarks {one} and {two} are at one place in {count} of {len(raw)} specimens.")
+            findings.append(f"Landmarks {earlier} and {later} are at one place in {count} of {len(raw)} specimens.")
     return findings
 
 
@@ -148,7 +148,9 @@ def find_other_scales(raw: LandmarkConfigurations) -> list[str]:
     """Return a sentence on each specimen whose size differs so much that its unit or scale is another one."""
     # Root mean squares, which missing landmarks hardly change.
     known = [points[seen] for points, seen in zip(raw.points, raw.observed, strict=True)]
-    sizes = np.array([float(np.sqrt(np.var(one - one.mean(axis=0)))) if len(one) > 1 else np.nan for one in known])
+    sizes = np.array(
+        [float(np.sqrt(np.var(shape - shape.mean(axis=0)))) if len(shape) > 1 else np.nan for shape in known]
+    )
     ratios = sizes / np.nanmedian(sizes) if np.isfinite(sizes).any() else sizes
     return [
         f"{name} is {ratio:.3g} times the median size, so its unit or scale differs."

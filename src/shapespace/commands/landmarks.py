@@ -1,4 +1,4 @@
-"""What `landmarks` does: landmarks of marked specimens carried to all scans of a correspondence, and checked."""
+"""Command `landmarks`: landmarks of marked specimens transferred to all scans of a correspondence, and checked."""
 
 from __future__ import annotations
 
@@ -74,20 +74,20 @@ def transfer_landmarks(
         InputError: no correspondence, no usable landmarks, or landmarks that contradict each other.
         FileError: something cannot be read or written.
     """
-    same = _open(scans, marked, say)
+    same = _open_correspondence(scans, marked, say)
     sets = [] if semilandmarks is None else _read_sets(semilandmarks)
     planned = Semilandmarks.of(same.specimens, sets) if sets else None
     if len(same.given) > 1:
-        for one in same.specimens.check():
-            if one.finding:
-                say(f"{_sentence(one)} See shapespace landmarks check.")
+        for check in same.specimens.check():
+            if check.finding:
+                say(f"{_finding_sentence(check)} See shapespace landmarks check.")
     records: list[dict[str, Any]] = []
     names, all_points = [*same.specimens.names, *(planned.names if planned else ())], dict[str, FloatArray]()
     make_folder(output)
     with progress(len(same.specimens.surfaces), "landmarks on", "scan", quiet=quiet) as bar:
         for surface in same.specimens.surfaces:
-            scan = _scan(same, surface, say)
-            record, texts = _transferred(same, surface, scan, planned)
+            scan = _read_scan(same, surface, say)
+            record, texts = _transfer_to_scan(same, surface, scan, planned)
             for ending, text in texts.items():
                 write_text(output / f"{surface.name}{ending}", text)
             points = {row["name"]: np.array(row["position"]) for row in record["landmarks"]}
@@ -99,16 +99,18 @@ def transfer_landmarks(
         number = {name: k for k, name in enumerate(names, start=1)}
         curves = [[number[name] for name in row] for row in planned.sliders()]
         write_rows(output / CURVE_SLIDERS, ("before", "slide", "after"), curves)
-        surface_rows = [[number[name]] for one in sets if one.kind == "patch" for name in one.names]
+        surface_rows = [[number[name]] for patch in sets if patch.kind == "patch" for name in patch.names]
         write_rows(output / SURFACE_SLIDERS, ("surface",), surface_rows)
     doubtful = [record for record in records if record["status"] == "doubtful"]
-    lines = first_lines(doubtful, _doubts, "more scans with doubtful landmarks")
+    lines = first_lines(doubtful, _doubtful_lines, "more scans with doubtful landmarks")
     total = f"landmarks of {len(records)} scans in {output} and in {output / TPS}"
     return Outcome({"folder": str(output), "records": records}, [*lines, total])
 
 
-def _doubts(record: Mapping[str, Any]) -> list[str]:
-    reasons = ", ".join(f"{one['name']} ({one['reason']})" for one in record["landmarks"] if one["reason"])
+def _doubtful_lines(record: Mapping[str, Any]) -> list[str]:
+    reasons = ", ".join(
+        f"{landmark['name']} ({landmark['reason']})" for landmark in record["landmarks"] if landmark["reason"]
+    )
     return [f"{record['name']}: doubtful landmarks: {reasons}"]
 
 
@@ -146,23 +148,23 @@ def check_marked(marked: Path, scans: Path, output: Path | None, *, say: Say) ->
         InputError: no correspondence, or fewer than two marked specimens.
         FileError: something cannot be read or written.
     """
-    checks = _open(scans, marked, say).specimens.check()
+    checks = _open_correspondence(scans, marked, say).specimens.check()
     if output is not None:
         header = list(asdict(checks[0]))
-        write_rows(output, header, [list(asdict(one).values()) for one in checks])
-    found = [one for one in checks if one.finding]
-    for one in found:
-        say(_sentence(one))
+        write_rows(output, header, [list(asdict(check).values()) for check in checks])
+    found = [check for check in checks if check.finding]
+    for check in found:
+        say(_finding_sentence(check))
     lines: list[str] = []
     for kind in ("landmark", "specimen"):
         errors: dict[str, list[float]] = {}
-        for one in checks:
-            errors.setdefault(getattr(one, kind), []).append(100 * one.error_share)
+        for check in checks:
+            errors.setdefault(getattr(check, kind), []).append(100 * check.error_share)
         means = sorted(((fmean(shares), name) for name, shares in errors.items()), reverse=True)
         listed = ", ".join(f"{name} {share:.1f} %" for share, name in means[:LISTED])
         lines.append(f"mean leave-one-out error by {kind}, largest first, of the size: {listed}")
     lines.append(f"{len(checks)} landmarks compared, {len(found)} with a finding")
-    return Outcome([asdict(one) for one in checks], lines, exit_code=int(bool(found)))
+    return Outcome([asdict(check) for check in checks], lines, exit_code=int(bool(found)))
 
 
 def suggest_specimens(scans: Path, marked: Path | None = None, count: int = 5, *, say: Say) -> Outcome:
@@ -177,7 +179,7 @@ def suggest_specimens(scans: Path, marked: Path | None = None, count: int = 5, *
     Raises:
         InputError: no correspondence, or no usable landmarks in `marked`.
     """
-    found = _open(scans, marked, say).specimens.suggest(count)
+    found = _open_correspondence(scans, marked, say).specimens.suggest(count)
     lines = [
         f"{rank}. {name}: mean shape distance to the nearest marked specimen {100 * share:.1f} % of the size"
         for rank, (name, share) in enumerate(found, start=1)
@@ -185,7 +187,7 @@ def suggest_specimens(scans: Path, marked: Path | None = None, count: int = 5, *
     return Outcome([{"name": name, "mean_distance_share": share} for name, share in found], lines)
 
 
-def _open(scans: Path, marked: Path | None, say: Say) -> _Correspondence:
+def _open_correspondence(scans: Path, marked: Path | None, say: Say) -> _Correspondence:
     if not (scans / SUMMARY).is_file():
         surface_files([scans])  # names what is wrong with an unfinished correspondence
         raise InputError(
@@ -234,11 +236,11 @@ def _read_marks(
     marks.report_unused(say)
     if not given:
         raise InputError(f"{folder}: all marked specimens are excluded from the correspondence; mark others.")
-    _say_names(given, say)
+    _report_names(given, say)
     return given
 
 
-def _say_names(given: Mapping[str, Mapping[str, FloatArray]], say: Say) -> None:
+def _report_names(given: Mapping[str, Mapping[str, FloatArray]], say: Say) -> None:
     """Print landmark names that only some marked specimens have, and those that differ in case or punctuation alone."""
     count = Counter(name for marks in given.values() for name in marks)
     alike: dict[str, list[str]] = {}
@@ -251,8 +253,8 @@ def _say_names(given: Mapping[str, Mapping[str, FloatArray]], say: Say) -> None:
         say(f"Not all {len(given)} marked specimens have {', '.join(some)}; each comes from those that have it.")
 
 
-def _scan(same: _Correspondence, surface: Mesh, say: Say) -> Mesh | None:
-    """Return the raw scan of a surface, None with a message where it cannot be read."""
+def _read_scan(same: _Correspondence, surface: Mesh, say: Say) -> Mesh | None:
+    """Return the raw scan of a surface, or None and a message if it cannot be read."""
     file = same.folder / f"{surface.name}{RECORD}"
     try:
         path = read(CorrespondRecord, json_of(file), file.name, CORRESPOND_AGAIN).path
@@ -264,7 +266,7 @@ def _scan(same: _Correspondence, surface: Mesh, say: Say) -> Mesh | None:
         return None
 
 
-def _transferred(
+def _transfer_to_scan(
     same: _Correspondence, surface: Mesh, scan: Mesh | None, semilandmarks: Semilandmarks | None
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """Return the record of one scan, and ending -> text of its files; given landmarks stay where they are."""
@@ -310,8 +312,8 @@ def _transferred(
     return record, point_texts(points, descriptions, table_text(header, table))
 
 
-def _sentence(one: LandmarkCheck) -> str:
+def _finding_sentence(check: LandmarkCheck) -> str:
     return (
-        f"{one.specimen}: landmark {one.landmark!r} is {100 * one.error_share:.1f} % of the size from its prediction "
-        f"by the other marked specimens ({one.finding})."
+        f"{check.specimen}: landmark {check.landmark!r} is {100 * check.error_share:.1f} % of the size from its "
+        f"prediction by the other marked specimens ({check.finding})."
     )

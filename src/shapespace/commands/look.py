@@ -1,4 +1,4 @@
-"""What `check` and `info` do: facts of meshes, models, fits and correspondences."""
+"""Commands `check` and `info`: facts of meshes, models, fits and correspondences."""
 
 from __future__ import annotations
 
@@ -43,16 +43,16 @@ def check(
     symmetric: bool = False,
     say: Callable[[str], None],
 ) -> Outcome:
-    """Say what is in each mesh file, what is wrong with it, and what fitting will do about it.
+    """Return the content of each mesh file, its problems, and how fitting will handle them.
 
     A file that cannot be read, or takes more memory than there is, is reported with an error, and the next one read.
 
     Args:
         files: files and folders.
-        recursive: whether to take what lies in folders below these too.
+        recursive: whether to search subfolders too.
         strict: whether a mesh with triangles that use vertices with non-finite coordinates is not usable.
         output: folder in which the repaired meshes are written in mm, as NAME.ply (default: none is written).
-        unit: of the files, a name of `MM_PER_UNIT` (default: mm).
+        unit: unit of the files, a name of `MM_PER_UNIT` (default: mm).
         mirror: write mirror images, such as of left bones among right ones.
         symmetric: write symmetric meshes, for templates with left and right pairs of vertices; see `symmetrise`.
         say: called with each message on skipped files.
@@ -87,13 +87,15 @@ def check(
             if repaired is not None and path in targets:
                 repaired = replace(repaired, vertices=MM_PER_UNIT[unit or "mm"] * repaired.vertices, landmarks={})
                 if symmetric:
-                    repaired, facts = _symmetrised(repaired)
+                    repaired, facts = _symmetrise(repaired)
         except (ShapespaceError, MemoryError) as error:
             no_memory = f"{path}: not enough memory to read it; thin the scan first, as by MeshLab."
             reason = no_memory if isinstance(error, MemoryError) else naming(path, str(error))
             reports.append({"file": str(path), "usable": False, "error": reason})
             continue
-        findings = [{"level": one.level, "what": one.problem, "action": one.action} for one in report.findings]
+        findings = [
+            {"level": finding.level, "what": finding.problem, "action": finding.action} for finding in report.findings
+        ]
         findings += [{"level": "note", "what": note, "action": ""} for note in mesh.notes]
         usable = {"usable": repaired is not None}
         reports.append({"file": str(path), **usable, **asdict(report), **facts, "findings": findings})
@@ -119,7 +121,7 @@ def _check_lines(report: Mapping[str, Any]) -> list[str]:
     return [*lines, "  usable" if report["usable"] else "  not usable for fitting"]
 
 
-def _symmetrised(mesh: Mesh) -> tuple[Mesh, dict[str, Any]]:
+def _symmetrise(mesh: Mesh) -> tuple[Mesh, dict[str, Any]]:
     """Return the symmetric mesh, and its facts."""
     from shapespace.correspondence.symmetric_template import symmetrise  # compiled
 
@@ -135,12 +137,12 @@ def _symmetrised(mesh: Mesh) -> tuple[Mesh, dict[str, Any]]:
 
 
 def info(file: Path) -> Outcome:
-    """Say what a model, a mesh, the record of a fit, a folder with a store, or one in correspondence contains.
+    """Return the facts of a model, a mesh, the record of a fit, a folder with a store, or a correspondence.
 
     Raises:
-        FileError: it cannot be read, or is none of these.
+        FileError: it cannot be read, or is another file.
     """
-    facts = _facts(file)
+    facts = _facts_of_path(file)
     lines: list[str] = []
     for key, value in facts.items():
         scans: Mapping[str, str] = value if key in _BY_SCAN else {}
@@ -149,7 +151,7 @@ def info(file: Path) -> Outcome:
     return Outcome(facts, lines)
 
 
-def _facts(path: Path) -> dict[str, Any]:
+def _facts_of_path(path: Path) -> dict[str, Any]:
     if path.is_dir() and (results := results_at(path)) is not None:
         return {"kind": "store", **store_facts(results)}
     if path.is_dir() and looks_like_model(path):
@@ -204,7 +206,7 @@ def correspondence_facts(folder: Path) -> dict[str, Any]:
     """Return the facts of a folder that `shapespace correspond` wrote; lengths are shares of the size of each object.
 
     Raises:
-        FileError: it is none, or it cannot be read.
+        FileError: the folder is no correspondence, or cannot be read.
     """
     from shapespace.report.blocks.wording import known, median
     from shapespace.report.inputs.correspondence_folder import Corresponded, concerns_of, distance_share
@@ -287,7 +289,7 @@ def model_facts(model: ShapeModel) -> dict[str, Any]:
 
 
 def training_shapes_note(model: ShapeModel) -> str:
-    """Return what the training shapes in a model mean for privacy, or what a model without them lacks."""
+    """Return a sentence on the privacy of the training shapes in a model, or on the effect of their absence."""
     if (training := model.training) is None:
         return f"The model contains no training shapes, so {NOT_CALIBRATED}."
     count = f"{len(training)} of its {model.n_training}" if len(training) < model.n_training else str(len(training))

@@ -1,4 +1,4 @@
-"""What a command returns, and how its lines are made."""
+"""Result of a command, and the format of its lines."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class Aside(str):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a command did.
+    """Result of a command.
 
     Args:
         facts: content of `--json`, or a function that returns it, for content that takes time to make.
-        lines: what is printed on standard output without `--json`; only an `Aside` goes to standard error.
+        lines: lines on standard output without `--json`; only an `Aside` goes to standard error.
         notes: sentences on standard error, before the facts or lines.
         errors: sentences on standard error, after the facts or lines.
         exit_code: 0 done; 1 some failed; 2 all failed.

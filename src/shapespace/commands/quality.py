@@ -1,4 +1,4 @@
-"""What `quality` does: compactness, generalisation and specificity of a model, a folder in correspondence, or two."""
+"""Command `quality`: compactness, generalisation and specificity of a model, a folder in correspondence, or two."""
 
 from __future__ import annotations
 
@@ -29,24 +29,24 @@ from shapespace.types import FloatArray, Mesh
 _SURFACES = (".dense.ply", ".fitted.ply", SURFACE)
 _UNITS = {
     "compactness": "of the variance",
-    "generalisation": "mm, surface to surface, on shapes left out",
-    "generalisation_vertices": "mm, vertex to vertex, on shapes left out",
+    "generalisation": "mm, surface to surface, on held-out shapes",
+    "generalisation_vertices": "mm, vertex to vertex, on held-out shapes",
     "specificity": "mm, surface to surface, from random shapes to the nearest one",
     "specificity_vertices": "mm, vertex to vertex, from random shapes to the nearest one",
     "reconstruction": "mm, surface to surface, on unseen shapes",
     "reconstruction_vertices": "mm, vertex to vertex, on unseen shapes",
 }
-"""Measures, and what their numbers are."""
+"""Measures, and the meaning of their numbers."""
 _MOST_TARGETS = 2  # differences are computed between two targets
 
 
 _FEW_VERTICES = 200_000
-"""Of all shapes together: below it, a measurement takes less time than workers to start."""
+"""Vertices of all shapes below which a measurement takes less time than starting workers."""
 
 
 @dataclass(frozen=True)
 class QualityOptions:
-    """What to measure, and against what.
+    """Measures of quality, and the data that they refer to.
 
     Args:
         representations: what the modes move, for all targets or one for each; two for one target compare it with
@@ -58,7 +58,7 @@ class QualityOptions:
             correspondence in which more than half of the surfaces need review.
 
     Raises:
-        InputError: representations that there are not.
+        InputError: representations that do not exist.
     """
 
     representations: Sequence[str] = ("vertices",)
@@ -73,13 +73,13 @@ class QualityOptions:
 
 @dataclass(frozen=True, eq=False)
 class _Target:
-    """A model or meshes in correspondence, by a name that tells it from the other."""
+    """A model or meshes in correspondence, with a name that distinguishes it from the other target."""
 
     name: str
     data: ShapeModel | Sequence[Mesh]
     config: QualityConfig
     unit_ratios: Mapping[str, float] = field(default_factory=dict[str, float])
-    """Of meshes by their names without endings, as of `CorrespondRecord`."""
+    """Unit ratios of meshes by their names without endings, see `CorrespondRecord`."""
 
     @property
     def names(self) -> list[str]:
@@ -109,18 +109,20 @@ def quality(
     Raises:
         FileError: something cannot be read or written.
         CorrespondenceError: meshes of one target differ in vertices or triangles.
-        InputError: targets that there are not, too few meshes, or two that have not the same shapes.
+        InputError: targets that do not exist, too few meshes, or two targets with different shapes.
     """
     notes: list[str] = []
-    loaded = _targets(targets, config, options, notes, quiet=quiet)
+    loaded = _load_targets(targets, config, options, notes, quiet=quiet)
     make_folder(output)
     run = QualityRunner(execution, output, quiet)
     measured = [_measure(target, options, run, quiet=quiet) for target in loaded]
     parts = [_as_quality(t, m, options) for t, m in zip(loaded, measured, strict=True)]
-    notes += [_missing(t, m) for t, m in zip(loaded, measured, strict=True) if m.missing_share or m.left_out_vertices]
+    notes += [
+        _missing_sentence(t, m) for t, m in zip(loaded, measured, strict=True) if m.missing_share or m.left_out_vertices
+    ]
     result = parts[0]
     if len(parts) > 1:
-        differences = {name: _measured(c) for name, c in measured[0].differences(measured[1]).items()}
+        differences = {name: _measured_curve(c) for name, c in measured[0].differences(measured[1]).items()}
         comparison = _comparison_sentences(loaded, measured[0].differences(measured[1]))
         result = structs.replace(
             result, others=(parts[1],), differences=differences, sentences=(*result.sentences, *comparison)
@@ -135,7 +137,7 @@ def quality(
     write_text(output / "quality.json", json_text(result))
     with waiting("drawing the curves", quiet=quiet):
         _draw(result, output, notes)
-    lines = [line for one in (result, *result.others) for line in quality_lines(one)]
+    lines = [line for item in (result, *result.others) for line in quality_lines(item)]
     lines += [*result.sentences, f"All numbers are in {output / 'quality.json'}"]
     return Outcome({"folder": str(output), **to_json(result)}, lines, notes)
 
@@ -151,7 +153,7 @@ def quality_lines(quality: Quality) -> list[str]:
     return out
 
 
-def _targets(
+def _load_targets(
     paths: Sequence[Path], config: QualityConfig, options: QualityOptions, notes: list[str], *, quiet: bool
 ) -> list[_Target]:
     names = list(options.representations)
@@ -161,7 +163,7 @@ def _targets(
     loaded: list[tuple[ShapeModel | list[Mesh], dict[str, float]]] = [
         (ShapeModel.load(p), {})
         if not p.is_dir() and looks_like_model(p)
-        else _meshes(p, notes, gauge, options, quiet=quiet)
+        else _read_meshes(p, notes, gauge, options, quiet=quiet)
         for p in paths
     ]
     pairs = [(k, names[min(k, len(names) - 1)]) for k in range(len(paths))]
@@ -171,19 +173,19 @@ def _targets(
     out: list[_Target] = []
     for k, name in pairs:
         called = f"{paths[k]}, {name}" if several else str(paths[k])
-        out.append(_Target(called, loaded[k][0], _of_representation(config, name, names), loaded[k][1]))
+        out.append(_Target(called, loaded[k][0], _config_of_representation(config, name, names), loaded[k][1]))
     if len(out) == _MOST_TARGETS and not any(isinstance(target.data, ShapeModel) for target in out):
-        _refuse_unlike(out)
+        _check_same_shapes(out)
     return out
 
 
-def _of_representation(config: QualityConfig, name: str, names: Sequence[str]) -> QualityConfig:
-    """Return the configuration of one representation; control points belong to B-splines, where one is among them."""
+def _config_of_representation(config: QualityConfig, name: str, names: Sequence[str]) -> QualityConfig:
+    """Return the configuration of one representation; `vertices`, compared with B-splines, has no control points."""
     splines = name != "vertices" or set(names) == {"vertices"}
     return replace(config, representation=name, control_points=config.control_points if splines else None)
 
 
-def _refuse_unlike(targets: Sequence[_Target]) -> None:
+def _check_same_shapes(targets: Sequence[_Target]) -> None:
     first, second = (target.names for target in targets)
     if len(first) != len(second) or (first != second and set(first) & set(second)):
         lacking = sorted(set(first) ^ set(second))
@@ -194,10 +196,10 @@ def _refuse_unlike(targets: Sequence[_Target]) -> None:
         )
 
 
-def _meshes(
+def _read_meshes(
     folder: Path, notes: list[str], gauge: Gauge, options: QualityOptions, *, quiet: bool
 ) -> tuple[list[Mesh], dict[str, float]]:
-    """Return the meshes of a folder in the unit of most of them, and the ratios of those that were in another."""
+    """Return the meshes of a folder in the unit of most meshes, and the unit ratios of the others."""
     listed, review = reviewed_surfaces([folder], "--with-doubtful", with_doubtful=options.with_doubtful)
     if summary := review_summary(review):
         notes.append(f"{folder}: {summary}.")
@@ -217,8 +219,8 @@ def _meshes(
     return meshes, {surface_stem(file): ratio for file, ratio in listed.unit_ratios.items()}
 
 
-def _scans(target: _Target, folder: Path | None, *, quiet: bool) -> list[Mesh] | None:
-    """Return the scans of the meshes of a target, in their order; None where none are given, or none are needed."""
+def _read_scans(target: _Target, folder: Path | None, *, quiet: bool) -> list[Mesh] | None:
+    """Return the scans of the meshes of a target, in their order; None if no scans are given or needed."""
     if folder is None or isinstance(target.data, ShapeModel):
         return None
     by_name = {surface_stem(file): file for file in mesh_files([folder]).files}
@@ -239,23 +241,23 @@ def _scans(target: _Target, folder: Path | None, *, quiet: bool) -> list[Mesh] |
 
 
 def _measure(target: _Target, options: QualityOptions, run: Runner, *, quiet: bool) -> ModelQuality:
-    unseen = [] if options.unseen is None else _meshes(options.unseen, [], "shape", options, quiet=quiet)[0]
-    scans = _scans(target, options.scans, quiet=quiet)
+    unseen = [] if options.unseen is None else _read_meshes(options.unseen, [], "shape", options, quiet=quiet)[0]
+    scans = _read_scans(target, options.scans, quiet=quiet)
     with steps(None, f"measuring {target.name}, in", "step", quiet=quiet) as step:
         return measure_quality(target.data, target.config, scans=scans, unseen=unseen, progress=step, run=run)
 
 
-def _missing(target: _Target, result: ModelQuality) -> str:
+def _missing_sentence(target: _Target, result: ModelQuality) -> str:
     text = (
         f"{target.name}: {100 * result.missing_share:.1f} % of the vertices are missing, and nothing is measured there"
     )
     if not result.left_out_vertices:
         return f"{text}."
     number = "1 vertex" if result.left_out_vertices == 1 else f"{result.left_out_vertices} vertices"
-    return f"{text}; {number} that fewer than half of the meshes show {'is' if number[:2] == '1 ' else 'are'} left out."
+    return f"{text}; {number} that fewer than half of the meshes show {'is' if number[:2] == '1 ' else 'are'} excluded."
 
 
-def _measured(curve: Curve) -> Measured:
+def _measured_curve(curve: Curve) -> Measured:
     low, high = tuple(curve.low.tolist()), tuple(curve.high.tolist())
     return Measured(mean=tuple(curve.mean.tolist()), modes=tuple(curve.counts.tolist()), low=low, high=high)
 
@@ -282,7 +284,7 @@ def _as_quality(target: _Target, result: ModelQuality, options: QualityOptions) 
             "unseen": None if options.unseen is None else str(options.unseen),
         },
     )
-    measured = {name: _measured(curve) for name, curve in curves.items() if curve is not None}
+    measured = {name: _measured_curve(curve) for name, curve in curves.items() if curve is not None}
     return structs.replace(quality, **measured)
 
 
@@ -301,7 +303,7 @@ def _comparison_sentences(targets: Sequence[_Target], differences: dict[str, Cur
 
 
 def _draw(result: Quality, output: Path, notes: list[str]) -> None:
-    """Write the curves as PNG and SVG, where the extra `report` is there."""
+    """Write the curves as PNG and SVG, if the extra `report` is installed."""
     if importlib.util.find_spec("matplotlib") is None or importlib.util.find_spec("PIL") is None:
         notes.append('The curves are not drawn; pip install "shapespace[report]" adds what draws them.')
         return
@@ -315,8 +317,8 @@ class QualityRunner:
     """Runs the parts of a measurement by an executor.
 
     Args:
-        execution: where they run; a small measurement runs in this process unless something else is asked for.
-        folder: that all workers see, for a file with the shapes during the measurement; made if absent.
+        execution: Executor of the parts; a small measurement runs in this process unless another executor is requested.
+        folder: folder that all workers see, for a file with the shapes during the measurement; made if absent.
         quiet: whether workers do not report that code is compiled.
     """
 

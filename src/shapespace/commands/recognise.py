@@ -1,4 +1,4 @@
-"""What `recognise` does: train, predict, transfer, study."""
+"""Command `recognise`: train, predict, transfer, study."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ from shapespace.types import FloatArray
 def read_scans(path: Path, say: Callable[[str], None] = lambda _: None) -> list[ScanCoefficients]:
     """Return the fits in a folder that `fit` wrote, or in a coefficients.csv, in the order of their names or rows.
 
-    `say` is called for shards of a store that cannot be read; the fits in them are left out.
+    A message is printed for each shard of a store that cannot be read, whose fits are excluded.
 
     Raises:
         FileError: it cannot be read.
         FileFormatError: a record or the table is damaged.
-        InputError: the folder holds no records of fits.
+        InputError: the folder contains no records of fits.
     """
     if not path.is_dir():
         return read_coefficients(path)
@@ -52,7 +52,7 @@ def read_scans(path: Path, say: Callable[[str], None] = lambda _: None) -> list[
     except OSError as error:
         raise read_error(path, error) from error
     if not files:
-        raise InputError(f"{path} holds no results of fits; give a folder that shapespace fit wrote.")
+        raise InputError(f"{path} contains no results of fits; give a folder that shapespace fit wrote.")
     return [from_record(file.name.removesuffix(RECORD), read_record(file)) for file in files]
 
 
@@ -87,7 +87,7 @@ def recognise_train(
     Raises:
         FileError: something cannot be read, or the classifier not written.
         FileFormatError: results or labels are damaged.
-        InputError: what `train_classifier` refuses, fits of another model than `expression_of`, or a name that does
+        InputError: invalid input of `train_classifier`, fits of another model than `expression_of`, or a name that does
             not end in .skops.
         ModelFileError: `expression_of` does not part identity and expression.
         ShapespaceError: the extra `recognise` is not installed.
@@ -104,7 +104,7 @@ def recognise_train(
         model, fitted_with = AdditiveModel.load(expression_of), one_model(scans)
         if model.shape.content_hash != fitted_with:
             raise InputError(
-                f"{results} holds fits of the model {fitted_with[:12]}, and {expression_of} is "
+                f"{results} contains fits of the model {fitted_with[:12]}, and {expression_of} is "
                 f"{model.shape.content_hash[:12]}; give the model that the scans were fitted with."
             )
         projection = model.rotation[model.n_identity :]
@@ -125,7 +125,7 @@ def recognise_train(
     )
     left_out = "subjects" if checked["by"] == "subject" else "scans"
     share = checked["macro_accuracy"]
-    accuracy = [] if share is None else [f"macro accuracy on {left_out} left out: {100 * share:.1f} %"]
+    accuracy = [] if share is None else [f"macro accuracy on held-out {left_out}: {100 * share:.1f} %"]
     return Outcome(
         {"file": str(output), **facts, "notes_on_classes": classes},
         [line, *classes, *accuracy],
@@ -142,11 +142,11 @@ def recognise_predict(
     strict: bool,
     say: Callable[[str], None],
 ) -> Outcome:
-    """Write the classifier's answer for each fit in `results`, and count what came out.
+    """Write the prediction for each fit in `results`, and count the outcomes.
 
     The counts are `answered`, `unsure`, `doubtful` (unsure for the fit's sake), `failed` (the fit failed, or its
-    neutral face is missing) and `neutral` (faces that others are compared with). `say` is called with what cannot be
-    read.
+    neutral face is missing) and `neutral` (faces that others are compared with). A message is printed for input that
+    cannot be read.
 
     Raises:
         FileError: something cannot be read, or the answers not written.
@@ -195,7 +195,7 @@ def recognise_predict(
     return Outcome(
         {"file": str(output), **counts, "answers": rows},
         [*first_lines(rows, _answer_line, f"more; all are in {output}"), total],
-        errors=["shapespace: no scan could be answered for; the reasons stand in the table."] if none else (),
+        errors=["shapespace: no scan could be classified; the reasons are in the table."] if none else (),
         exit_code=2 if none else int(counts["failed"] > 0 or (strict and counts["doubtful"] + counts["unsure"] > 0)),
     )
 
@@ -228,7 +228,7 @@ def recognise_transfer(model: Path, person: Path, expression: Path, output: Path
         values = np.asarray(record.z, dtype=np.float64)
         if values.shape != (additive.shape.n_modes,):
             raise InputError(
-                f"{path} holds {len(values)} coefficients of {additive.shape.n_modes}; fit the scan with all modes."
+                f"{path} contains {len(values)} coefficients of {additive.shape.n_modes}; fit the scan with all modes."
             )
         z.append(values)
     write_mesh(output, additive.transfer(z[0], z[1]))
@@ -265,7 +265,8 @@ def recognise_study(
         report, holds = run_own_study(output, data, model, folds=folds, execution=execution, seed=seed, quiet=quiet)
     targets = json.loads(read_bytes(output / "recognition.json"))["targets"]
     reached = [
-        f"{one['what']}: {one['reached']} ({one['target']}{'' if one['met'] else '; missed'})" for one in targets
+        f"{target['what']}: {target['reached']} ({target['target']}{'' if target['met'] else '; missed'})"
+        for target in targets
     ]
     lines = [*holds.splitlines(), *reached, f"The report is {report}"]
     return Outcome({"report": str(report), "targets": targets}, lines, page=None if no_open else report)

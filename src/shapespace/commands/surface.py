@@ -1,4 +1,4 @@
-"""What `surface` does: label volumes in files to surfaces in files."""
+"""Command `surface`: label volumes in files to surfaces in files."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ def write_surfaces(
     The record of an unusable volume has an `error`.
 
     Args:
-        volumes: label volumes, and folders of them.
+        volumes: label volumes, and folders of label volumes.
         output: output folder.
         labels: labels or names of segments that form one object, or `all` (default: the only label of the volume).
         smooth: standard deviation of the smoothing in voxels, 0 to 10; 0 for none (default 1.3).
         keep_pieces: keep all pieces and cavities (default: the largest piece, cavities filled, with a message).
         recursive: also search subfolders of the given folders.
-        max_memory_bytes: memory limit for a volume and its surface; a volume that needs more is refused before it is
+        max_memory_bytes: memory limit for a volume and its surface; a volume that needs more is rejected before it is
             read (default: `MAX_MEMORY_BYTES`, 4G, or 80 % of the free memory if that is less).
         quiet: show no progress.
         say: called with each message on skipped files and unusable volumes.
@@ -85,7 +85,7 @@ def write_surfaces(
             except (ShapespaceError, MemoryError) as error:
                 short = f"{path}: there is not enough memory for it; crop or resample it, as by 3D Slicer."
                 reason = short if isinstance(error, MemoryError) else naming(path, str(error))
-                # A surface of an earlier run would contradict what is said.
+                # A surface of an earlier run would contradict the message.
                 remove_file(target)
                 bar.clear()
                 say(reason)
@@ -95,7 +95,7 @@ def write_surfaces(
                 records.append({**known, "surface": str(target), **_facts(made)})
             bar.update()
     usable = [record for record in records if "error" not in record]
-    _name_the_odd(usable)
+    _note_odd_surfaces(usable)
     for record in usable:
         record["notes"] += record["odd"]
     facts = {"folder": str(output), "volumes": len(records), "surfaces": len(usable), "records": records}
@@ -106,10 +106,10 @@ def write_surfaces(
 def _lines(made: Sequence[Mapping[str, Any]], volumes: int, folder: Path) -> list[str]:
     odd = [f"{record['name']}.ply: {note}" for record in made[LISTED:] for note in record["odd"]]
     total = f"{len(made)} of {volumes} {'volume' if volumes == 1 else 'volumes'} to surfaces in {folder}: LPS, mm"
-    return [*first_lines(made, _described), *odd, total]
+    return [*first_lines(made, _describe_record), *odd, total]
 
 
-def _described(record: Mapping[str, Any]) -> list[str]:
+def _describe_record(record: Mapping[str, Any]) -> list[str]:
     size = " x ".join(f"{mm:.3g}" for mm in record["voxel_mm"])
     labels = f"label{'s' if len(record['labels']) > 1 else ''} {', '.join(map(str, record['labels']))}"
     line = (
@@ -124,7 +124,7 @@ def _names(files: Sequence[Path]) -> list[str]:
     bare = [path.with_name(volume_name(path)) for path in files]
     times = Counter(bare)
     alone = [short if times[short] == 1 else path for path, short in zip(files, bare, strict=True)]
-    # What stands after the last dot would not be part of a name.
+    # Text after the last dot would not be part of a name.
     return names_for([path.with_name(f"{path.name}.volume") for path in alone])
 
 
@@ -149,8 +149,8 @@ def _facts(made: VolumeSurface) -> dict[str, Any]:
     }
 
 
-def _name_the_odd(records: Sequence[dict[str, Any]]) -> None:
-    """Say of each surface whether it is an earlier one again, of other voxels than most, or of quite another size."""
+def _note_odd_surfaces(records: Sequence[dict[str, Any]]) -> None:
+    """Note each surface that equals an earlier surface, has other voxels than most, or has quite another size."""
     first: dict[Any, str] = {}
     for record in records:
         earlier = first.setdefault((record["vertices"], record["volume_mm3"], *record["bounds_mm"][0]), record["name"])

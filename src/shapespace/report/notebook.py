@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from shapespace.store.results import Results
 
 Drawn: TypeAlias = tuple[Still, str]
-"""A picture, and what stands below it."""
+"""A picture, and its caption."""
 _SHARES = (0.9, 0.95, 0.98)  # of the variance; usual choices for the number of modes
 _MODES_SHOWN = 2  # layout: rows
 _PANEL = (220, 290)  # layout: pixels
@@ -125,7 +125,7 @@ def html_of_model(model: ShapeModel) -> str:
 
 
 def html_of_fit(result: FitResult) -> str:
-    """Return a fit for a notebook: where it is how far from the scan, the verdict, and the largest coefficients."""
+    """Return the notebook view of a fit: its distances from the scan, its status, and its largest coefficients."""
     overlap = result.overlap_distances
     largest = sorted(range(len(result.z)), key=lambda k: -abs(result.z[k]))[:_MOST_COEFFICIENTS]
     seen, covered = percent(overlap.model_seen_share), percent(overlap.scan_covered_share)
@@ -152,7 +152,7 @@ def html_of_fit(result: FitResult) -> str:
 
 def html_of_quality(quality: ModelQuality) -> str:
     """Return a quality for a notebook: its curves, and each measure with all modes."""
-    rows = [("Shapes", f"{quality.shapes}, left out in {quality.folds} folds")] if quality.shapes else []
+    rows = [("Shapes", f"{quality.shapes}, held out in {quality.folds} folds")] if quality.shapes else []
     for name in _CURVES:
         curve = getattr(quality, name)
         if curve is not None:
@@ -180,12 +180,12 @@ def notebook_html(
     """Return the notebook view of an object; its repr if the extra `report` is not installed.
 
     Args:
-        of: the object.
-        title: above the rest.
-        sentences: what matters first.
+        of: object of the view.
+        title: heading of the view.
+        sentences: sentences below the heading.
         rows: names and values.
-        draw: makes a picture with its caption; None for none.
-        blocks: of a report, below the rest.
+        draw: function that returns a picture with its caption; None for no picture.
+        blocks: blocks of a report, below the rest.
     """
     try:
         require_report_extra()
@@ -245,7 +245,7 @@ def html_of_cohort(cohort: Cohort) -> str:
     ]
     blocks: list[Block] = _table(["shape", *columns], cells, "The first shapes", len(cohort))
     if len(cohort.table.columns) > len(columns):
-        blocks.append(Text(f"{len(cohort.table.columns) - len(columns)} more columns are left out."))
+        blocks.append(Text(f"{len(cohort.table.columns) - len(columns)} more columns are omitted."))
     return notebook_html(cohort, "Cohort", [], rows, blocks=[*blocks, Notes(cohort.notes[:_MOST_NOTES])])
 
 
@@ -351,7 +351,7 @@ def _shorten(table: Table, total: int, rest: str = "more rows") -> list[Block]:
     """Return a table with at most `MOST_ROWS` rows, and the number of further ones of `total` rows."""
     shown = Table(table.columns, table.rows[:MOST_ROWS], table.caption)
     left = total - len(shown.rows)
-    return [shown] if left <= 0 else [shown, Text(f"{left:,} {rest} are left out.")]
+    return [shown] if left <= 0 else [shown, Text(f"{left:,} {rest} are omitted.")]
 
 
 def _surface(mesh: Mesh, caption: str) -> Callable[[], Drawn]:

@@ -49,17 +49,17 @@ def run_own_study(
     """Fit the labelled scans in `data`, classify them, and write recognition.json and its report.
 
     Args:
-        folder: for the results; fits that are there already are kept.
+        folder: folder of the results; existing fits are reused.
         data: BU-3DFE, Bosphorus, or a folder with labels.csv; see `scan_set`.
-        model_file: the shape model, which should know none of these people; where it parts identity and expression,
+        model_file: shape model, which must not be built from these people; if it separates identity and expression,
             expression alone is a feature as well.
-        folds: by subject, at most; fewer where there are fewer people.
-        execution: where the scans are fitted.
-        seed: of the folds.
+        folds: largest number of folds by subject; fewer if there are fewer people.
+        execution: Executor of the fits.
+        seed: seed of the folds.
         quiet: no progress bar.
 
     Returns:
-        The path of the report, and what the folder of scans holds, in words.
+        The path of the report, and a summary of the folder of scans.
 
     Raises:
         FileError: something cannot be read or written.
@@ -94,11 +94,11 @@ class OwnFits:
 
     Args:
         codes: features by name, each (N, k); rows of failed fits are NaN.
-        status: N words.
-        expression: (N,) what each scan shows.
-        subject: (N,) who.
-        level: (N,) at which intensity.
-        model_hash: of the model.
+        status: status of each of the N fits.
+        expression: (N,) expression of each scan.
+        subject: (N,) subject of each scan.
+        level: (N,) intensity of each expression.
+        model_hash: content hash of the model.
     """
 
     codes: Mapping[str, FloatArray]
@@ -116,7 +116,7 @@ class OwnFits:
         model: ShapeModel,
         additive: AdditiveModel | None,
     ) -> OwnFits:
-        """Return what the records tell of the scans, in their order."""
+        """Return the features and labels of the scans from their records, in their order."""
         z = np.full((len(scans), model.n_modes), np.nan)
         for row, record in enumerate(records):
             if record.is_fitted:
@@ -138,17 +138,17 @@ class OwnFits:
 
     @cached_property
     def tested(self) -> BoolArray:
-        """(N,) which are not neutral: (M,) of them."""
+        """(N,) mask of the M scans that are not neutral."""
         return np.asarray(self.expression != NEUTRAL, dtype=np.bool_)
 
     @cached_property
     def labels(self) -> TextArray:
-        """(M,) what those tested show."""
+        """(M,) expressions of the tested scans."""
         return self.expression[self.tested]
 
     @cached_property
     def subjects(self) -> TextArray:
-        """(M,) who they are."""
+        """(M,) subjects of the tested scans."""
         return self.subject[self.tested]
 
     @property
@@ -158,7 +158,7 @@ class OwnFits:
 
     @property
     def neutral_known(self) -> bool:
-        """Whether there is a neutral scan of everybody who is tested."""
+        """Whether there is a neutral scan of each tested subject."""
         return set(self.subjects.tolist()) <= set(self.subject[~self.tested].tolist())
 
     def folds(self, code: FloatArray, settings: Mapping[str, Any]) -> list[evaluate.Fold]:
@@ -182,7 +182,7 @@ def _check(scans: Sequence[ScanEntry], data: Path, folds: int) -> None:
             raise InputError(f"{data}: {name} is shown by {len(own)} person only, so it cannot be tested; add people.")
     if len(people) < _FEWEST_SUBJECTS or len(classes) < 2:
         raise InputError(
-            f"{data}: a study needs at least {_FEWEST_SUBJECTS} people and two expressions beside neutral, not "
+            f"{data}: a study needs at least {_FEWEST_SUBJECTS} people and two expressions besides neutral, not "
             f"{len(people)} and {len(classes)}."
         )
     parted = min(folds, len(people))
@@ -193,19 +193,19 @@ def _check(scans: Sequence[ScanEntry], data: Path, folds: int) -> None:
 
 
 def _document(fits: OwnFits, holds: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return recognition.json."""
-    rows, folds, predictions = _compared(fits, settings)
+    """Return the content of recognition.json."""
+    rows, folds, predictions = _compare_classifiers(fits, settings)
     test = evaluate.permutation_test(folds, permutations=99, seed=settings["seed"])
     accuracy, interval = fits.accuracy_of(predictions.predicted)
     labels, classes = fits.labels.tolist(), predictions.classes
     doubtful, failed = fits.status.count("doubtful"), fits.status.count("failed")
     report_parts: list[Part] = [
-        TextPart(title="What was tested", text=(
+        TextPart(title="Data and protocol", text=(
             *holds.splitlines(),
             f"{doubtful} of {len(fits.status)} fits are doubtful and {failed} failed. Doubtful fits are classified "
             "and counted; a failed one counts as wrong.",
-            "The shape model was given and stays the same in all folds; scaling and classifiers are made anew "
-            "without the people tested. Where it was made of the same people, these figures flatter.",
+            "The shape model is the same in all folds; scaling and classifiers are trained without the tested people. "
+            "If the model was built from the same people, these figures are too good.",
         )),
         parts.table(
             "Classifiers on unseen people",
@@ -219,12 +219,12 @@ def _document(fits: OwnFits, holds: str, settings: Mapping[str, Any]) -> dict[st
         parts.confusion("Confusion", labels, predictions.predicted, classes,
                         "Classifier chosen inside the training people, neutral face unknown."),
         parts.per_class("Each expression", labels, predictions.predicted, classes),
-        parts.calibration("Whether the probabilities come true", labels, predictions.probabilities, classes),
+        parts.calibration("Calibration of the probabilities", labels, predictions.probabilities, classes),
     ]  # fmt: skip
     taught = fits.people * (settings["folds"] - 1) // settings["folds"]
     counts = [count for count in _CURVE if count < taught]
     if counts:
-        report_parts.append(parts.learning_curve("How many people it takes", folds, counts, ceiling=None))
+        report_parts.append(parts.learning_curve("Learning curve", folds, counts, ceiling=None))
     summary = [
         f"{len(classes)} expressions of unseen people are classified with an accuracy of {parts.words(accuracy)} "
         f"(95 % interval over people {parts.words(interval[0])} to {parts.words(interval[1])}; chance "
@@ -235,7 +235,7 @@ def _document(fits: OwnFits, holds: str, settings: Mapping[str, Any]) -> dict[st
     return parts.document(title, summary, [], report_parts, settings=settings, model_hashes=[fits.model_hash])
 
 
-def _compared(
+def _compare_classifiers(
     fits: OwnFits, settings: Mapping[str, Any]
 ) -> tuple[list[tuple[object, ...]], list[evaluate.Fold], evaluate.Predictions]:
     """Return a row for each feature and classifier, and folds and answers of the last feature, neutral unknown."""
@@ -272,8 +272,12 @@ def _by_intensity(fits: OwnFits, predictions: evaluate.Predictions) -> list[Part
             "By intensity",
             [("Intensity", "percent"), ("Macro accuracy", "percent"), ("Scans", "count")],
             [
-                (one, fits.accuracy_of(predictions.predicted, level == one)[0], int((level == one).sum()))
-                for one in levels
+                (
+                    intensity,
+                    fits.accuracy_of(predictions.predicted, level == intensity)[0],
+                    int((level == intensity).sum()),
+                )
+                for intensity in levels
             ],
         )
     ]

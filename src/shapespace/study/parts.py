@@ -56,14 +56,14 @@ def per_class(title: str, labels: Sequence[str], predicted: Sequence[str], class
     return table(
         title,
         [("Expression", "text"), *((head, "percent") for head in ("Precision", "Recall", "F1")), ("Scans", "count")],
-        [(name, one.precision, one.recall, one.f1, one.count) for name, one in scores.items()],
+        [(name, score.precision, score.recall, score.f1, score.count) for name, score in scores.items()],
     )
 
 
 def calibration(
     title: str, labels: Sequence[str], probabilities: FloatArray, classes: Sequence[str]
 ) -> CalibrationPart:
-    """Return how often probabilities come true."""
+    """Return the calibration of probabilities."""
     curve = evaluate.calibration(labels, probabilities, classes)
     low = np.minimum(np.floor(10 * np.asarray(curve.confidence)) / 10, 0.9)
     bins = tuple(
@@ -99,12 +99,12 @@ def accuracy_of(
 
 
 def inner_folds(folds: Sequence[evaluate.Fold]) -> int:
-    """Return how many folds the training people are parted into: four, or fewer where there are fewer people."""
+    """Return the number of folds of the training people: four, or fewer if there are fewer people."""
     return min(4, *(len(set(fold.train_subjects)) for fold in folds))
 
 
 def fixed(folds: Sequence[evaluate.Fold], classifier: str) -> evaluate.Predictions | None:
-    """Return the predictions of one classifier, or None where it asks for more samples than there are."""
+    """Return the predictions of one classifier, or None if it needs more samples than there are."""
     try:
         return evaluate.fixed_predictions(folds, classifier)
     except InputError:
@@ -130,7 +130,7 @@ def document(
     settings: Mapping[str, Any],
     model_hashes: Sequence[str],
 ) -> dict[str, Any]:
-    """Return the whole of recognition.json, checked as the report will."""
+    """Return the complete content of recognition.json, checked as the report checks it."""
     recognition = Recognition(
         version=__version__,
         created=datetime.now(UTC).isoformat(timespec="seconds"),

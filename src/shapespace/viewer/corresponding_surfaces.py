@@ -1,4 +1,4 @@
-"""Data of the viewer's page of corresponding surfaces: single surfaces, and the position of a vertex on all of them."""
+"""Data of the viewer's page of corresponding surfaces: single surfaces, and positions of a vertex on all surfaces."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ class Surfaces:
     """A folder in correspondence for the page.
 
     Args:
-        folder: that `shapespace correspond` wrote.
+        folder: folder that `shapespace correspond` wrote.
 
     Raises:
         FileError: correspondence.json or the mean shape cannot be read.
-        FileFormatError: one of them is damaged.
+        FileFormatError: correspondence.json or the mean shape is damaged.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -102,7 +102,7 @@ class Surfaces:
 
     def packed_population(self) -> bytes:
         """Return the number of scans that show each vertex, and the RMS standard deviation of its position along the
-        surface, percent of the size, where files have it; all surfaces are read for it."""
+        surface, percent of the size, if files contain it; all surfaces are read for it."""
         population = self._population()
         arrays: dict[str, Any] = {"seen": population.seen_count.astype(np.int32)}
         if population.position_std is not None:

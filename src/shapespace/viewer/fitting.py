@@ -52,9 +52,9 @@ class Upload:
     Args:
         scan: the uploaded file, under a name of our own.
         display_name: the user's file name, for messages and the record; never used as a path.
-        folder: for the results.
-        model: the model's file.
-        model_name: the model's name, for the record.
+        folder: folder of the results.
+        model: file of the model.
+        model_name: name of the model, for the record.
         landmarks: file of landmarks to start from, or None.
         dense: whether to compute the dense surface too.
     """
@@ -101,7 +101,7 @@ def fit_upload(pipe: Connection, upload: Upload) -> None:
         )
 
     model = ShapeModel.load(upload.model)
-    # A file that cannot be read cannot be fitted either, and the record holds the reason.
+    # A file that cannot be read cannot be fitted either, and the record contains the reason.
     with contextlib.suppress(ShapespaceError, MemoryError):
         send("scan", **_preview(model, upload))
     job, config = Job(NAME, upload.scan, upload.landmarks), FitConfig(dense=upload.dense)
@@ -198,9 +198,9 @@ def run_worker(
 
     Args:
         worker: a function that a new process can import.
-        upload: its argument.
+        upload: argument of `worker`.
         on_message: called with each message, in this thread.
-        stop: ends the process when set.
+        stop: event that ends the process when it is set.
         limit_s: seconds after which the process is ended.
     """
     if stop.is_set():

@@ -53,16 +53,16 @@ _SECRET_BYTES = 32  # bytes, 256 bits: cannot be guessed
 _IGNORED_HEADERS = (b"range", b"if-range")
 """Partial responses are not supported."""
 
-_NO_TOKEN = "This address needs the token that shapespace view printed; open the whole address."
+_NO_TOKEN = "This address needs the token that shapespace view printed; open the complete address."
 _WRONG_TOKEN = "This token is not, or no longer, that of this viewer; open the address that shapespace view printed."
 
 
 class Access:
     """The secrets of one viewer: its token, its cookie and its one-time ticket.
 
-    The printed address holds the token, which is exchanged for the cookie and does not stay in the browser's history. A
-    ticket replaces the token where others can read it: on the command line that starts the browser, and in the saved
-    output of a notebook.
+    The printed address contains the token. It is exchanged for the cookie and does not stay in the history of the
+    browser. A ticket replaces the token where others can read it: on the command line that starts the browser, and in
+    the saved output of a notebook.
 
     Args:
         token: None for a new random token of 256 bits.
@@ -87,13 +87,13 @@ class Access:
 
 
 class Guard:
-    """Middleware that refuses requests without the token or from other pages, and adds the security headers.
+    """Middleware that rejects requests without the token or from other pages, and adds the security headers.
 
     Args:
         app: the guarded application.
-        access: its secrets.
+        access: secrets of the viewer.
         cookie_name: browsers share cookies between ports, so the name should contain the port.
-        loopback: whether only this machine can reach the server; requests for other host names are then refused.
+        loopback: whether only this machine can reach the server; requests for other host names are then rejected.
         framed: whether notebooks on this machine may show the page in a frame.
         frames: whether pages show others of the application in frames.
     """
@@ -125,7 +125,7 @@ class Guard:
         await (self._early_response(Request(scope)) or self._app)(scope, receive, send_with_headers)
 
     def _early_response(self, request: Request) -> Response | None:
-        """Return a refusal or the redirect that sets the cookie; None for a request that may pass."""
+        """Return an error response or the redirect that sets the cookie; None for a request that may pass."""
         # Against DNS rebinding: a foreign host name that resolves to this machine.
         if self._loopback and _host_name(request.headers.get("host", "")) not in LOOPBACK:
             return refusal(421, "This viewer answers only under 127.0.0.1 or localhost; open it by that address.")

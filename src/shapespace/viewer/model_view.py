@@ -37,7 +37,7 @@ from shapespace.types import Mesh
 from shapespace.viewer.fitting import pack_staged
 
 MAX_MODEL_BYTES = 48 * 2**20
-"""Modes beyond this size are not sent, and the page says so; in the browser they take twice as much memory."""
+"""Modes beyond this size are not sent, and the page shows a note; in the browser they take twice as much memory."""
 _BYTES_PER_VERTEX = 6  # bytes of a mode; three coordinates of 16 bits
 MAX_LISTED = 1000
 """Fits of a store that the page lists: those with the most concerns."""
@@ -50,8 +50,8 @@ class ModelView:
 
     Args:
         model: the shape model.
-        model_name: its name on the page.
-        folder: of the fits, or None.
+        model_name: name of the model on the page.
+        folder: folder of the fits, or None.
     """
 
     def __init__(self, model: ShapeModel, model_name: str, folder: Path | None = None) -> None:
@@ -69,7 +69,7 @@ class ModelView:
 
         Args:
             path: the file or folder.
-            model: the model's file, needed where the records of the folder do not name an existing one.
+            model: file of the model, needed if the records of the folder do not name an existing model.
 
         Raises:
             FileError: it cannot be read.
@@ -87,7 +87,7 @@ class ModelView:
         folder = Folder(path)
         if not has_fits(folder):
             if deeper := next(path.glob("*/**/*.fit.json"), None):
-                raise InputError(f"{path} holds no fits itself; give the folder that does, such as {deeper.parent}.")
+                raise InputError(f"{path} contains no fits itself; give their folder, such as {deeper.parent}.")
             if (report := path / "report.html").is_file():
                 raise InputError(f"{path} is an analysis without fits; open {report} in a browser.")
         fits = listed_fits(folder)
@@ -189,7 +189,7 @@ class ModelView:
         return fit.record.model.hash == self.model.content_hash
 
     def _safe_row(self, fit: SavedFit) -> dict[str, Any]:
-        """Return the row of `fit`, or the row of an unreadable fit if its record holds invalid values."""
+        """Return the row of `fit`, or the row of an unreadable fit if its record contains invalid values."""
         try:
             with _as_damaged(fit.name):
                 return self._row(fit)
@@ -231,7 +231,7 @@ def _as_damaged(name: str) -> Generator[None]:
     except ShapespaceError:
         raise
     except Exception as error:
-        raise FileFormatError(f"The files of {name} are damaged: they hold invalid values; {FIT_AGAIN}.") from error
+        raise FileFormatError(f"The files of {name} are damaged: they contain invalid values; {FIT_AGAIN}.") from error
 
 
 def listed_fits(folder: Folder) -> list[SavedFit]:
@@ -255,12 +255,12 @@ def shape_of(model: ShapeModel, z: Sequence[float]) -> Mesh:
     """
     values = np.asarray(z, dtype=np.float64)
     is_valid = values.ndim == 1 and len(values) <= model.n_modes
-    # The model itself refuses invalid coefficients.
+    # The model itself rejects invalid coefficients.
     return model.mesh(values * model.stddev[: len(values)] if is_valid else values)
 
 
 def _reason_with_name(fit: SavedFit) -> str:
-    """Return the reason of `fit` with its scan's name in place of an absolute path, which may hold spaces."""
+    """Return the reason of `fit` with its scan's name in place of an absolute path, which may contain spaces."""
     name = fit.record.scan.name
     if not name:
         return fit.reason

@@ -1,4 +1,4 @@
-"""The viewer in a notebook cell: a thread serves it on this machine, and the cell's output holds a one-time ticket."""
+"""The viewer in a notebook cell: a thread serves it on this machine; the cell's output contains a one-time ticket."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class NotebookView:
     """A viewer that runs until `close` or the end of this process; a notebook shows it in a frame.
 
     Args:
-        server: runs in `thread`.
-        thread: of the server.
-        access: the secrets of this viewer.
-        port: of 127.0.0.1.
-        height_px: of the frame in the notebook.
-        resources: closed with the viewer.
+        server: server that runs in `thread`.
+        thread: thread of the server.
+        access: secrets of this viewer.
+        port: port at 127.0.0.1.
+        height_px: height of the frame in the notebook, pixels.
+        resources: resources that are closed with the viewer.
     """
 
     def __init__(

@@ -35,7 +35,7 @@ def require_view_extra() -> None:
     """Check that the packages of the extra `view` are installed.
 
     Raises:
-        ShapespaceError: they are not; the message says how to install them.
+        ShapespaceError: a package is missing; the message states how to install it.
     """
     for package in ("starlette", "uvicorn"):
         if importlib.util.find_spec(package) is None:
@@ -91,7 +91,7 @@ def serve(
     from shapespace.viewer.server import make_app, make_surfaces_app
     from shapespace.viewer.uploaded_scans import FOLDER_PREFIX, Limits, Scans
 
-    with _stopped_by_signals(), ExitStack() as stack:
+    with _end_by_signals(), ExitStack() as stack:
         if has_surfaces:
             make = partial(make_surfaces_app, Surfaces(path))
         else:
@@ -114,16 +114,16 @@ def serve_studio(
     read_only: bool = False,
     say: Callable[[str], None] = print,
 ) -> None:
-    """Show a project of the studio in the browser until Ctrl-C; running commands go on.
+    """Show a project of the studio in the browser until Ctrl-C; running commands continue.
 
     Args:
         project: folder of the project, created if it is new or empty; None for the start page.
-        forms: of the commands that the page offers.
+        forms: forms of the commands that the page offers.
         host: address to listen at.
         port: port (default: the first free one from 7860).
         open_browser: whether to open the page.
         max_upload_mb: size limit of a scan that is dropped onto the page, in MB.
-        read_only: show the project, and refuse edits and jobs.
+        read_only: show the project, and reject edits and jobs.
         say: called with the address, which contains the token.
 
     Raises:
@@ -138,7 +138,7 @@ def serve_studio(
     from shapespace.viewer.studio.app import Studio, make_studio
 
     require_report_extra()
-    with _stopped_by_signals(), ExitStack() as stack:
+    with _end_by_signals(), ExitStack() as stack:
         studio = Studio(forms, project, max_upload_mb * 2**20, read_only=read_only)
         stack.callback(studio.close)
         what = "viewer" if read_only else "studio"
@@ -212,7 +212,7 @@ def make_server(app: object) -> uvicorn.Server:
 
 
 @contextlib.contextmanager
-def _stopped_by_signals() -> Generator[None]:
+def _end_by_signals() -> Generator[None]:
     """Let SIGTERM and SIGHUP end the block as an exception does, so that temporary folders are removed."""
     if threading.current_thread() is not threading.main_thread():
         yield

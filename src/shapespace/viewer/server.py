@@ -142,7 +142,7 @@ class _Endpoints:
             return binary(self._view.packed_fit(request.path_params["name"]))
         except KeyError:
             raise HTTPException(
-                404, "There is no such fit; reload the page to see what the folder holds now."
+                404, "There is no such fit; reload the page to see the current fits of the folder."
             ) from None
 
     async def export(self, request: Request) -> Response:
@@ -265,7 +265,7 @@ class _Endpoints:
 
 
 async def json_body(request: Request, max_bytes: int) -> Mapping[str, Any]:
-    """Return the JSON object in the body of `request`, and refuse anything else with 400 or 413."""
+    """Return the JSON object in the body of `request`, and reject anything else with 400 or 413."""
     try:
         content: object = plain_json(await whole_body(request, max_bytes, "The request is too long."))
     except ValueError:
@@ -276,13 +276,13 @@ async def json_body(request: Request, max_bytes: int) -> Mapping[str, Any]:
 
 
 async def whole_body(request: Request, max_bytes: int, too_large: str) -> bytes:
-    """Return the body of `request`; arguments as of `body_pieces`."""
+    """Return the body of `request`; see `body_pieces` for the arguments."""
     async with aclosing(body_pieces(request, max_bytes, too_large)) as pieces:
         return b"".join([piece async for piece in pieces])
 
 
 async def body_pieces(request: Request, max_bytes: int, too_large: str) -> AsyncGenerator[bytes]:
-    """Yield the body of `request`, and refuse it with 413 and the sentence `too_large` beyond `max_bytes`."""
+    """Yield the body of `request`, and reject it with 413 and the sentence `too_large` beyond `max_bytes`."""
     announced = request.headers.get("content-length", "")
     if len(announced) > 15 or (announced.isdigit() and announced.isascii() and int(announced) > max_bytes):
         raise HTTPException(413, too_large)
@@ -423,7 +423,7 @@ def json_response(content: object, status: int = 200) -> Response:
 
 
 def binary(content: bytes, file_name: str | None = None) -> Response:
-    """Return `content` as bytes, as a download where `file_name` is given."""
+    """Return `content` as bytes, as a download if `file_name` is given."""
     headers = {} if file_name is None else {"Content-Disposition": f'attachment; filename="{file_name}"'}
     return Response(content, media_type="application/octet-stream", headers=headers)
 
@@ -432,8 +432,8 @@ def application(routes: Sequence[BaseRoute], public: Callable[[str], str]) -> St
     """Return an application of `routes`.
 
     Args:
-        routes: of the application.
-        public: removes the folders of this machine from an error message.
+        routes: routes of the application.
+        public: function that removes the folders of this machine from an error message.
     """
 
     async def input_error(_: Request, error: Exception) -> Response:
@@ -444,7 +444,7 @@ def application(routes: Sequence[BaseRoute], public: Callable[[str], str]) -> St
         exception_handlers={
             HTTPException: _http_error,
             ShapespaceError: input_error,
-            ClientDisconnect: _disconnected,
+            ClientDisconnect: _disconnect_error,
             OSError: _storage_error,
             Exception: _internal_error,
         },
@@ -459,7 +459,7 @@ async def _http_error(_: Request, error: Exception) -> Response:
     return refusal(error.status_code, _MESSAGES.get(error.detail, error.detail))
 
 
-async def _disconnected(_: Request, error: Exception) -> Response:
+async def _disconnect_error(_: Request, error: Exception) -> Response:
     return refusal(400, "The upload ended early.")
 
 

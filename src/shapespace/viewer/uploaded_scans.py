@@ -15,7 +15,7 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.viewer.fitting import NAME, PICTURE, PREVIEW, STOPPED, Message, Upload, Worker, fit_upload, run_worker
 
 FOLDER_PREFIX = "shapespace-view-"
-"""Of the temporary folder of a viewer."""
+"""Prefix of the temporary folder of a viewer."""
 MIN_LANDMARKS = 3  # landmarks that determine a pose
 _RESULT_FILES = (
     PREVIEW,
@@ -52,13 +52,13 @@ class UploadedScan:
     Args:
         key: a random name of our own.
         name: the user's file name, for display only.
-        folder: of the upload and its results.
+        folder: folder of the upload and its results.
         upload: the uploaded file; None once it is removed.
         dense: whether the fit includes the dense surface.
         state: waiting, fitting or done.
         events: messages of the fit so far; only the fit's thread appends.
-        stop: set to stop the fit.
-        future: of the fit.
+        stop: event that stops the fit when it is set.
+        future: future of the fit.
     """
 
     key: str
@@ -87,10 +87,10 @@ class Scans:
 
     Args:
         root: an empty folder that only this user can read; the caller removes it.
-        model: fits the scans.
-        model_name: for the records.
+        model: model that is fitted to the scans.
+        model_name: name of the model, for the records.
         limits: bounds on uploads and fits.
-        worker: fits one scan in a process of its own.
+        worker: function that fits one scan in a process of its own.
     """
 
     def __init__(
@@ -163,7 +163,7 @@ class Scans:
         scan.stop.set()
         assert scan.future is not None
         scan.future.cancel()
-        # At once where the fit has ended or has not begun.
+        # Immediately if the fit has ended or has not begun.
         scan.future.add_done_callback(lambda _: shutil.rmtree(scan.folder, ignore_errors=True))
 
     def close(self) -> None:

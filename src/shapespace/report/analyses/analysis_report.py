@@ -1,4 +1,4 @@
-"""Report of an analysis and its files: analysis.json with the parts, and tables, arrays and meshes beside it."""
+"""Report of an analysis and its files: analysis.json with the parts, and tables, arrays and meshes next to it."""
 
 from __future__ import annotations
 
@@ -93,22 +93,22 @@ class ResultTable:
     @staticmethod
     def of_fields(file: str, fields: Sequence[str], rows: Sequence[Sequence[Any]]) -> ResultTable:
         """Return a table that is a file alone, with the columns `fields`."""
-        return ResultTable(columns=[Column(field=one) for one in fields], rows=rows, file=file)
+        return ResultTable(columns=[Column(field=name) for name in fields], rows=rows, file=file)
 
     @property
     def part(self) -> TablePart:
         """The table of the page."""
-        columns = tuple(TableColumn(name=one.name, kind=one.kind) for one in self.columns if one.name)
+        columns = tuple(TableColumn(name=column.name, kind=column.kind) for column in self.columns if column.name)
         every = range(len(self.rows)) if self.shown is None else self.shown
         shown = [self.rows[k] for k in every if k < len(self.rows)]
-        rows = self._cells(shown, [bool(one.name) for one in self.columns])
+        rows = self._cells(shown, [bool(column.name) for column in self.columns])
         return TablePart(title=self.title, columns=columns, rows=rows, note=self.note, level=self.level)
 
     @property
     def file_rows(self) -> Rows:
         """Header and rows of the file."""
-        in_file = [bool(one.field) for one in self.columns]
-        return tuple(one.field for one in self.columns if one.field), self._cells(self.rows, in_file)
+        in_file = [bool(column.field) for column in self.columns]
+        return tuple(column.field for column in self.columns if column.field), self._cells(self.rows, in_file)
 
     @staticmethod
     def _cells(rows: Sequence[Sequence[Any]], used: Sequence[bool]) -> tuple[tuple[Any, ...], ...]:
@@ -133,7 +133,7 @@ def histogram_part(
     """Return the histogram of one or more sets of values.
 
     Args:
-        title: its title.
+        title: title of the histogram.
         values: label -> values.
         bins: number of bins between the ends of all values, or the edges of the bins.
         shares: shares of each set instead of counts.
@@ -165,7 +165,7 @@ class LengthFormat:
         return f"{value:{sign}.{2 if self.unit else 4}f}"
 
     def text(self, value: float, sign: str = "") -> str:
-        """Return a length with its unit; arguments as of `number`."""
+        """Return a length with its unit; see `number` for the arguments."""
         return self.number(value, sign) + self.suffix
 
     @property
@@ -193,22 +193,22 @@ class LengthFormat:
 
 @dataclass(frozen=True, eq=False)
 class AnalysisReport:
-    """What an analysis found, ready to be kept.
+    """Result of an analysis, ready to be written to a folder.
 
     Args:
-        question: the command that asks it.
-        title: of its report.
-        summary: sentences that say what was found, what matters first.
-        parts: of its report; they name arrays and meshes by their files.
+        question: command of the analysis, such as `compare`.
+        title: title of the report.
+        summary: sentences on the results, the most important first.
+        parts: parts of the report, which name arrays and meshes by their files.
         tables: file name (.csv) -> header and rows.
         arrays: file name (.npz) -> arrays by name.
         meshes: file name (.ply) -> mesh.
-        targets: what was aimed at, of benchmarks.
-        notes: who was left out and why, a sentence each.
-        settings: all that the result depends on, seeds among it.
-        model_hashes: of the models of the fits.
+        targets: targets of a benchmark; empty for other analyses.
+        notes: sentences on excluded shapes, each with the reason.
+        settings: all settings that the result depends on, including seeds.
+        model_hashes: content hashes of the models of the fits.
         methods: sample sizes, tests and assumptions, as in the last parts; None for predictions.
-        citations: of the methods, for methods.txt, besides those that follow from `methods`.
+        citations: references for methods.txt, in addition to those that follow from `methods`.
         orientation: named views and links of the figures; None for views that are chosen by the form of the object.
     """
 
@@ -243,13 +243,15 @@ class AnalysisReport:
         """
         every = tuple(content)
         parts = tuple(
-            one.part if isinstance(one, ResultTable) else one for one in every if one.title or isinstance(one, Part)
+            item.part if isinstance(item, ResultTable) else item
+            for item in every
+            if item.title or isinstance(item, Part)
         )
-        tables = {one.file: one.file_rows for one in every if isinstance(one, ResultTable) and one.file}
+        tables = {item.file: item.file_rows for item in every if isinstance(item, ResultTable) and item.file}
         return cls(question=question, title=title, parts=parts, tables=tables, **known)
 
     def analysis(self) -> Analysis:
-        """Return what analysis.json says."""
+        """Return the content of analysis.json."""
         return Analysis(
             question=self.question,
             version=__version__,
@@ -268,7 +270,7 @@ class AnalysisReport:
         )
 
     def save(self, folder: Path | str) -> Path:
-        """Write all of it to a folder, analysis.json last, and return the path of that.
+        """Write the report and its files to a folder, analysis.json last, and return the path of analysis.json.
 
         Raises:
             FileError: the folder cannot be written, or the disk is full.
@@ -320,7 +322,7 @@ def shape_change_parts(cohort: Cohort, **known: Any) -> tuple[MorphPart | Deform
     vectors of others; nothing for point clouds.
 
     Args:
-        cohort: of the shapes.
+        cohort: cohort of the shapes.
         **known: fields of both kinds of parts, such as `arrays`, `low`, `high`, `low_label`, `high_label`, `times`.
     """
     if cohort.faces is not None:
@@ -335,7 +337,7 @@ def scree_part(eigenvalues: FloatArray, *, axis: str = "principal component") ->
 
     Args:
         eigenvalues: (K,) variances along the axes, in their order.
-        axis: what the axes are.
+        axis: name of an axis, for the label of the plot.
     """
     shares = 100 * eigenvalues / eigenvalues.sum()
     numbers = tuple(map(float, range(1, len(shares) + 1)))
@@ -474,7 +476,7 @@ def shape_settings(cohort: Cohort) -> dict[str, Any]:
 
 
 def _landmark_words(value: Any) -> Any:
-    """Return a text, part or record, or a tuple of these, that calls the vertices of shapes landmarks."""
+    """Return a text, part, record or tuple in which the vertices of shapes are called landmarks."""
     if isinstance(value, tuple):
         return tuple(map(_landmark_words, cast(tuple[Any, ...], value)))
     if isinstance(value, Struct):
@@ -515,12 +517,12 @@ def cohort_report(
         cohort: the shapes.
         methods: sample sizes, tests and assumptions.
         summary: sentences on the results; those on limits of the cohort follow the first.
-        settings: of the analysis.
-        notes: who was left out and why; None for the notes of the cohort.
-        citations: of the methods.
-        imputations: those that the analysis combines; None for an analysis of the shapes as they are.
+        settings: settings of the analysis.
+        notes: sentences on excluded shapes, each with the reason; None for the notes of the cohort.
+        citations: references of the methods.
+        imputations: imputations that the analysis combines; None for an analysis of the shapes as they are.
         state_methods: whether the methods are parts of the page.
-        **known: further fields of the report; `model_hashes` is that of the fits by default.
+        **known: further fields of the report; by default, `model_hashes` is the hash of the model of the fits.
     """
     stated = methods_parts(methods) if state_methods else ()
     assumptions = tuple(filter(None, (_imputation_sentence(cohort, imputations),)))

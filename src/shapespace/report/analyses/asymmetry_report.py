@@ -37,7 +37,7 @@ _FEWEST_REPEATS = 10  # repeated scans; with fewer the measurement error is know
 
 
 def asymmetry_report(result: AsymmetryResult) -> AnalysisReport:
-    """Return the answer to how symmetric the objects of a cohort are."""
+    """Return the report on the asymmetry of the objects of a cohort."""
     order = np.argsort(-result.scores.mm, kind="stable")
     arrays, pictures = _maps_and_morphs(result, order)
     cohort = result.cohort
@@ -146,17 +146,17 @@ def _method_sentences(result: AsymmetryResult) -> tuple[str, ...]:
     pairs = f"{len(sides)} vertices, {sides.on_the_plane:.0f} of them on the plane" if sides.paired else (
         f"{len(sides)} vertices, each with the place nearest to its mirror image")  # fmt: skip
     measured, maps = (
-        f"Every shape is laid on its own mirror image, all of them together; {pairs}. The mean lies "
-        f"{100 * sides.off_share:.2f} % of its size from its mirror image. What a shape differs by from its image is "
-        "how far its sides are apart; half of it is the asymmetric part of the shape.",
-        "Maps are positive where a side stands further out than the other one.",
+        f"All shapes and their mirror images are aligned together; {pairs}. The mean lies "
+        f"{100 * sides.off_share:.2f} % of its size from its mirror image. The difference between a shape and its "
+        "mirror image is the difference between its sides; half of it is the asymmetric part of the shape.",
+        "Maps are positive where a side lies further out than the opposite side.",
     )
     if sides.classes:
         first, second = sides.classes
         measured, maps = (
             f"Each shape of the side {first} is compared with one of the side {second} of the same subject. The means "
             f"of the two sides lie {100 * sides.off_share:.2f} % of their size from each other.",
-            f"Maps are positive where the side {first} stands further out.",
+            f"Maps are positive where the side {first} lies further out.",
         )
     return (measured,) if sides.faces is None else (measured, maps)
 
@@ -170,13 +170,13 @@ def _limitation_notes(result: AsymmetryResult) -> Iterator[str]:
         )
     if 0 < repeats < _FEWEST_REPEATS:
         yield (
-            f"The measurement error is known from {repeats} repeated shapes only, so intervals are rough; "
-            f"{_FEWEST_REPEATS} are the least to go by."
+            f"The measurement error is known from {repeats} repeated shapes only, so intervals are rough; at least "
+            f"{_FEWEST_REPEATS} are needed."
         )
     if result.cohort.fitted is not None:
         yield (
-            "Fits hold asymmetry back where their model has little of it; docs/asymmetry.md says by how much. Dense "
-            "surfaces (--set surfaces=dense) of a model built with mirrored shapes lose least."
+            "Fits underestimate asymmetry if their model contains little asymmetry; docs/asymmetry.md states by how "
+            "much. Dense surfaces (--set surfaces=dense) of a model built with mirrored shapes underestimate it least."
         )
 
 
@@ -227,7 +227,7 @@ def _subject_table(result: AsymmetryResult, order: Any) -> ResultTable:
              v.high[k])
             for k, name in enumerate(result.subjects)
         ],
-        note="All of them stand in subjects.csv.",
+        note="All subjects are in subjects.csv.",
         file="subjects.csv",
         shown=order[:_MOST_ROWS],
     )  # fmt: skip
@@ -300,7 +300,15 @@ def _maps_and_morphs(result: AsymmetryResult, order: Any) -> tuple[Mapping[str, 
         note = (
             f"The first pattern, {100 * share:.0f} % of the fluctuating asymmetry; two standard deviations either way."
         )
-        add_morph("What subjects differ by most", "pattern", result.mean, pattern, note, "two one way", "two the other")
+        add_morph(
+            "Main pattern of fluctuating asymmetry",
+            "pattern",
+            result.mean,
+            pattern,
+            note,
+            "two one way",
+            "two the other",
+        )
     for rank, k in enumerate(subjects, 1):
         name = result.subjects[k]
         hidden = _unobserved(result)

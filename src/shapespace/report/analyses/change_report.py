@@ -56,15 +56,15 @@ _LEAST_ML_MM3 = 100.0
 _FEW = 10  # degrees of freedom; with fewer a standard deviation is known to no better than 22 %
 _SOURCES = {
     "rescans": "Standard deviations are those of rescans.",
-    "fits": "Standard deviations are those that the fits state of their coefficients, carried through modes and "
-    "alignment, and widened where the stable part spreads more; what the model cannot make is not in them.",
-    "stable": "Standard deviations are the spread over the stable part, one for the whole surface; of volumes nothing "
-    "is known.",
+    "fits": "Standard deviations are those of the coefficients of the fits, propagated through modes and "
+    "alignment, and widened where the stable part spreads more; variation outside the model is not included.",
+    "stable": "Standard deviations are the spread over the stable part, the same for the entire surface; those of "
+    "volumes are unknown.",
 }
 
 
 def change_report(change: ChangeResult) -> AnalysisReport:
-    """Return the report, tables, arrays and meshes of what changed."""
+    """Return the report of changes between visits, with its tables, arrays and meshes."""
     config = change.config
     arrays: dict[str, npt.NDArray[Any]] = {
         "before": change.before,
@@ -82,17 +82,17 @@ def change_report(change: ChangeResult) -> AnalysisReport:
         *_subject_parts(change, arrays),
         *_time_series(change),
         SurfaceMapPart(
-            title="What was taken as stable", level=2, arrays=ARRAYS, vertices="before", values="stable_share",
+            title="Stable part", level=2, arrays=ARRAYS, vertices="before", values="stable_share",
             unit="share of subjects", signed=False, limit=1.0,
-            note=f"Asked for: {config.stable if isinstance(config.stable, str) else 'vertices of a list'}. The "
-            "scans of a subject were brought to each other rigidly by these vertices.",
+            note=f"Selected: {config.stable if isinstance(config.stable, str) else 'vertices of a list'}. The "
+            "scans of a subject were aligned rigidly by these vertices.",
         ),
         *_file_tables(change),
     ]  # fmt: skip
     stable = config.stable
     return cohort_report(
         "change",
-        "What changed?",
+        "Change between visits",
         parts,
         change.cohort,
         summary=tuple(_summary(change)),
@@ -130,7 +130,7 @@ def _summary(change: ChangeResult) -> Iterator[str]:
         f"{share:.0f} % of the surface by more than its uncertainty, where noise alone gives 5 %."
     )
     if change.mean_change is not None:
-        volumes = np.array([change_or_rate(one, rate=change.config.rate).volumes_mm3[0] for one in subjects])
+        volumes = np.array([change_or_rate(subject, rate=change.config.rate).volumes_mm3[0] for subject in subjects])
         low, high = interval_of_mean(volumes)
         unit = _VolumeUnit.of(volumes.mean(), low, high)
         yield _test_sentence(change, change.mean_change.surface, "the mean change", "none")
@@ -151,12 +151,12 @@ def _summary(change: ChangeResult) -> Iterator[str]:
         )
         unequal = change.group_difference.surface.unequal_variances
         yield from (
-            dispersion_sentence(one, unequal, "mm")
-            for one in change.methods.dispersions
-            if is_dispersion_warning(one, unequal_variances=unequal) or not one.equal
+            dispersion_sentence(dispersion, unequal, "mm")
+            for dispersion in change.methods.dispersions
+            if is_dispersion_warning(dispersion, unequal_variances=unequal) or not dispersion.equal
         )
     if change.repeatability is None:
-        yield f"There are no rescans, so what is noise is not measured. {_SOURCES[change.uncertainty]}"
+        yield f"There are no rescans, so the measurement noise is unknown. {_SOURCES[change.uncertainty]}"
     else:
         repeatability, smallest = change.repeatability, change.repeatability.smallest_mm
         least = float(repeatability.volumes_smallest_mm3[0])
@@ -166,7 +166,7 @@ def _summary(change: ChangeResult) -> Iterator[str]:
             f"{'visit' if repeatability.visits == 1 else 'visits'} with rescans, the "
             f"smallest detectable change of one scan against another is {np.median(smallest):.2f} mm (median over the "
             f"surface; {smallest.max():.2f} mm at most), and {unit.text(least).lstrip('+')} {unit.name} of "
-            "volume; less is noise."
+            "volume; smaller changes are noise."
         )
     if change.mean_change is not None:
         yield multiplicity_sentence(change.methods)
@@ -182,7 +182,7 @@ class _VolumeUnit:
     @staticmethod
     def of(*mm3: float | FloatArray) -> _VolumeUnit:
         """Return ml if the largest of the volumes (mm³) is at least `_LEAST_ML_MM3`, else mm³."""
-        largest = max((float(np.abs(one).max(initial=0.0)) for one in map(np.asarray, mm3)), default=0.0)
+        largest = max((float(np.abs(volume).max(initial=0.0)) for volume in map(np.asarray, mm3)), default=0.0)
         return _VolumeUnit("mm³", 1.0) if largest < _LEAST_ML_MM3 else _VolumeUnit("ml", 1000.0)
 
     def text(self, mm3: float) -> str:
@@ -205,11 +205,11 @@ def _test_sentence(change: ChangeResult, test: MapTest, quantity: str, other: st
     )
     differs = "differs from" if test.omnibus_p <= _LEVEL else "is not shown to differ from"
     if significant.any() and test.omnibus_p > _LEVEL:
-        vertices = f"exploratory, since the test of the whole surface is not significant: {vertices}"
+        vertices = f"exploratory, since the test of the entire surface is not significant: {vertices}"
     limit = (
         f"; so few subjects can reach no p below {1 / test.permutations:.2g}" if 1 / test.permutations > _LEVEL else ""
     )
-    return f"As a whole {quantity} {differs} {other} ({_p_text(test.omnibus_p)}); {vertices}{limit}."
+    return f"Over the entire surface, {quantity} {differs} {other} ({_p_text(test.omnibus_p)}); {vertices}{limit}."
 
 
 def _p_text(p: float) -> str:
@@ -252,27 +252,27 @@ def _mean_change_parts(
 
 
 def _region_table(change: ChangeResult, test: MapTest) -> Part:
-    volumes = np.array([change_or_rate(one, rate=change.config.rate).volumes_mm3 for one in change.subjects])
+    volumes = np.array([change_or_rate(subject, rate=change.config.rate).volumes_mm3 for subject in change.subjects])
     unit = _VolumeUnit.of(volumes.mean(axis=0))
     every = zip(change.regions, [own / unit.mm3 for own in volumes.T], test.p, strict=True)
     rows = [(name, float(own.mean()), *interval_of_mean(own), float(p)) for name, own, p in every]
     return TablePart.of(
         "Volumes swept", ("of", f"mean, {unit.name}", "low", "high", "p"), rows,
-        note="With the 95 % interval of the mean; p with the error over all parts held.",
+        note="With the 95 % interval of the mean; p is family-wise over all parts.",
     )  # fmt: skip
 
 
 def _landmark_table(change: ChangeResult, test: MapTest, unit: str) -> ResultTable:
-    maps = np.stack([change_or_rate(one, rate=change.config.rate).along_mm for one in change.subjects])
+    maps = np.stack([change_or_rate(subject, rate=change.config.rate).along_mm for subject in change.subjects])
     names = ("mean", "stddev", "low", "high")
     every = zip(change.landmarks.names, change.landmarks.interpolate(maps.T), test.p, strict=True)
     return ResultTable(
         title="Landmarks",
         columns=(
-            Column("landmark", field="landmark"), *(Column(one, "mm", one) for one in names), Column("p", "p", "p"),
+            Column("landmark", field="landmark"), *(Column(name, "mm", name) for name in names), Column("p", "p", "p"),
         ),
         rows=[(name, own.mean(), own.std(ddof=1), *interval_of_mean(own), p) for name, own, p in every],
-        note=f"Along the normals, {unit}, with the 95 % interval of the mean; p with the error over all held.",
+        note=f"Along the normals, {unit}, with the 95 % interval of the mean; p is family-wise over all landmarks.",
         file="group_landmarks.csv",
     )  # fmt: skip
 
@@ -294,7 +294,7 @@ def _group_difference_parts(
     )
     return [
         SurfaceMapPart(
-            title=f"{second} beside {first}", level=2, arrays=ARRAYS, vertices="before", values="difference",
+            title=f"{second} compared with {first}", level=2, arrays=ARRAYS, vertices="before", values="difference",
             mask="difference_found", unit=f"mm{_per_time(change)}", note=note,
         )
     ]  # fmt: skip
@@ -304,7 +304,7 @@ def _noise_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) -> l
     repeatability = change.repeatability
     if repeatability is None:
         text = f"There are no rescans: no subject was scanned twice at one visit. {_SOURCES[change.uncertainty]}"
-        return [TextPart(title="What is noise", level=2, text=text)]
+        return [TextPart(title="Measurement noise", level=2, text=text)]
     arrays |= {"smallest_mm": repeatability.smallest_mm, "icc": repeatability.icc}
     rows: list[tuple[Any, ...]] = [
         (
@@ -339,12 +339,11 @@ def _noise_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) -> l
     )
     return [
         SurfaceMapPart(
-            title="What is noise", level=2, arrays=ARRAYS, vertices="before",
+            title="Measurement noise", level=2, arrays=ARRAYS, vertices="before",
             values="smallest_mm", signed=False,
             note="The smallest detectable change: 1.96 sqrt(2) times the within-subject standard deviation of "
-            f"{repeatability.scans} scans of {repeatability.visits} visits. A change of one scan against another "
-            "that is "
-            f"smaller is noise.{few}",
+            f"{repeatability.scans} scans of {repeatability.visits} visits. A smaller change between two scans is "
+            f"noise.{few}",
         ),
         TablePart.of("Repeatability", ("of", "within-subject stddev", "smallest detectable change", "ICC"), rows),
     ]  # fmt: skip
@@ -353,7 +352,7 @@ def _noise_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) -> l
 def _subject_table(change: ChangeResult) -> ResultTable:
     every = len(change.subjects)
     more = f" The first {MOST_ROWS} of {every}; all are in subjects.csv." if every > MOST_ROWS else ""
-    unit = _VolumeUnit.of(*(one.change.volumes_mm3[0] for one in change.subjects[:MOST_ROWS]))
+    unit = _VolumeUnit.of(*(subject.change.volumes_mm3[0] for subject in change.subjects[:MOST_ROWS]))
     columns = [
         Column("subject", field="subject"), Column(field="group"), Column("first", field="first"),
         Column("last", field="last"), Column("RMS", "mm", "rms_mm"), Column(field="most_mm"),
@@ -366,23 +365,23 @@ def _subject_table(change: ChangeResult) -> ResultTable:
     ]  # fmt: skip
     if change.time_unit:
         rates = ("rms_rate", "volume_rate_mm3", "volume_rate_stddev_mm3", "time_unit")
-        columns += [Column(field=one) for one in rates]
+        columns += [Column(field=name) for name in rates]
     rows: list[Sequence[Any]] = []
-    for one in change.subjects:
-        volume, stddev = float(one.change.volumes_mm3[0]), float(one.change.volumes_stddev_mm3[0])
-        observed = ... if one.observed is None else one.observed
-        along = one.change.along_mm[observed]
+    for subject in change.subjects:
+        volume, stddev = float(subject.change.volumes_mm3[0]), float(subject.change.volumes_stddev_mm3[0])
+        observed = ... if subject.observed is None else subject.observed
+        along = subject.change.along_mm[observed]
         row = [
-            one.name, one.group, one.visits[0].label, one.visits[-1].label, one.rms_mm,
-            float(along[np.abs(along).argmax()]), one.beyond_share, volume / unit.mm3, stddev / unit.mm3, volume,
-            stddev, volume / one.volume_before_mm3, len(one.visits), sum(visit.scans for visit in one.visits),
-            float(np.median(one.change.stddev_mm)), one.group,
+            subject.name, subject.group, subject.visits[0].label, subject.visits[-1].label, subject.rms_mm,
+            float(along[np.abs(along).argmax()]), subject.beyond_share, volume / unit.mm3, stddev / unit.mm3, volume,
+            stddev, volume / subject.volume_before_mm3, len(subject.visits),
+            sum(visit.scans for visit in subject.visits), float(np.median(subject.change.stddev_mm)), subject.group,
         ]  # fmt: skip
-        if one.rate is not None:
+        if subject.rate is not None:
             row += [
-                float(np.sqrt(np.average(one.rate.along_mm**2, weights=one.area_mm2))),
-                float(one.rate.volumes_mm3[0]),
-                float(one.rate.volumes_stddev_mm3[0]),
+                float(np.sqrt(np.average(subject.rate.along_mm**2, weights=subject.area_mm2))),
+                float(subject.rate.volumes_mm3[0]),
+                float(subject.rate.volumes_stddev_mm3[0]),
                 change.time_unit,
             ]
         rows.append(row)
@@ -394,7 +393,7 @@ def _subject_table(change: ChangeResult) -> ResultTable:
 
 def _subject_parts(change: ChangeResult, arrays: dict[str, npt.NDArray[Any]]) -> Iterator[Part | ResultTable]:
     yield _subject_table(change)
-    most = sorted(change.subjects, key=lambda one: -one.beyond_share)[:MOST_MAPS]
+    most = sorted(change.subjects, key=lambda subject: -subject.beyond_share)[:MOST_MAPS]
     for number, subject in enumerate(most, 1):
         before, after = change.surfaces(subject.name)
         key = f"subject{number}"
@@ -435,16 +434,16 @@ def _morph(
 
 
 def _time_series(change: ChangeResult) -> list[Part]:
-    if not change.time_unit or all(len(one.visits) < 3 for one in change.subjects):
+    if not change.time_unit or all(len(subject.visits) < 3 for subject in change.subjects):
         return []
-    unit = _VolumeUnit.of(*(visit.volume_mm3 for one in change.subjects[:MOST_CURVES] for visit in one.visits))
+    unit = _VolumeUnit.of(*(visit.volume_mm3 for subject in change.subjects[:MOST_CURVES] for visit in subject.visits))
     series = tuple(
         Series(
-            label=one.name,
-            x=tuple(visit.time for visit in one.visits),
-            y=tuple(visit.volume_mm3 / unit.mm3 for visit in one.visits),
+            label=subject.name,
+            x=tuple(visit.time for visit in subject.visits),
+            y=tuple(visit.volume_mm3 / unit.mm3 for visit in subject.visits),
         )
-        for one in change.subjects[:MOST_CURVES]
+        for subject in change.subjects[:MOST_CURVES]
     )
     every = len(change.subjects)
     more = f" The first {MOST_CURVES} of {every}; all are in visits.csv." if every > MOST_CURVES else ""
@@ -466,9 +465,9 @@ def _file_tables(change: ChangeResult) -> Iterator[ResultTable]:
         "visits.csv",
         ("subject", "visit", "time", "scans", "rms_since_first_mm", "volume_since_first_mm3"),
         [
-            (one.name, visit.label, visit.time, visit.scans, visit.rms_mm, visit.volume_mm3)
-            for one in change.subjects
-            for visit in one.visits
+            (subject.name, visit.label, visit.time, visit.scans, visit.rms_mm, visit.volume_mm3)
+            for subject in change.subjects
+            for visit in subject.visits
         ],
     )
     if len(change.regions) > 1:
@@ -476,8 +475,8 @@ def _file_tables(change: ChangeResult) -> Iterator[ResultTable]:
             "regions.csv",
             ("subject", "region", "volume_change_mm3", "stddev_mm3"),
             [
-                (one.name, name, float(one.change.volumes_mm3[k]), float(one.change.volumes_stddev_mm3[k]))
-                for one in change.subjects
+                (subject.name, name, float(subject.change.volumes_mm3[k]), float(subject.change.volumes_stddev_mm3[k]))
+                for subject in change.subjects
                 for k, name in enumerate(change.regions)
             ],
         )
@@ -486,7 +485,7 @@ def _file_tables(change: ChangeResult) -> Iterator[ResultTable]:
             "landmarks.csv",
             ("subject", "landmark", "x_mm", "y_mm", "z_mm", "moved_mm", "stddev_mm", "along_normal_mm",
              "along_normal_stddev_mm", "smallest_detectable_mm"),
-            [row for one in change.subjects for row in _landmark_rows(change, one)],
+            [row for subject in change.subjects for row in _landmark_rows(change, subject)],
         )  # fmt: skip
 
 
@@ -517,14 +516,14 @@ def _maps(change: ChangeResult) -> dict[str, npt.NDArray[Any]]:
     def single(values: Sequence[FloatArray]) -> npt.NDArray[Any]:
         return np.stack(values).astype(np.float32)
 
-    rates = [change_or_rate(one, rate=True) for one in change.subjects] if change.time_unit else []
+    rates = [change_or_rate(subject, rate=True) for subject in change.subjects] if change.time_unit else []
     return {
-        "subjects": np.array([one.name for one in change.subjects]),
-        "change_mm": single([blank_where(one.change.along_mm, one.unobserved) for one in change.subjects]),
-        "stddev_mm": single([one.change.stddev_mm for one in change.subjects]),
-        "beyond": np.stack([one.change.beyond for one in change.subjects]),
-        **({"rate_mm": single([one.along_mm for one in rates])} if rates else {}),
-        **({"rate_stddev_mm": single([one.stddev_mm for one in rates])} if rates else {}),
+        "subjects": np.array([subject.name for subject in change.subjects]),
+        "change_mm": single([blank_where(subject.change.along_mm, subject.unobserved) for subject in change.subjects]),
+        "stddev_mm": single([subject.change.stddev_mm for subject in change.subjects]),
+        "beyond": np.stack([subject.change.beyond for subject in change.subjects]),
+        **({"rate_mm": single([rate.along_mm for rate in rates])} if rates else {}),
+        **({"rate_stddev_mm": single([rate.stddev_mm for rate in rates])} if rates else {}),
     }
 
 
@@ -532,13 +531,13 @@ def _notes(change: ChangeResult) -> Iterator[str]:
     if change.single_visit_subjects:
         alone, every = len(change.single_visit_subjects), len(change.subjects) + len(change.single_visit_subjects)
         names = list_names(change.single_visit_subjects)
-        yield f"{alone} of {every} subjects are left out, who have one visit ({names})."
-    ends = {(one.visits[0].label, one.visits[-1].label) for one in change.subjects}
+        yield f"{alone} of {every} subjects are excluded because they have one visit ({names})."
+    ends = {(subject.visits[0].label, subject.visits[-1].label) for subject in change.subjects}
     if not change.time_unit and len(ends) > 1:
         pairs_of_visits = list_names([f"{first} to {last}" for first, last in sorted(ends)])
         yield f"Not all subjects have the same first and last visit ({pairs_of_visits})."
     if change.is_model_only:
         yield (
-            "The surfaces are the model's own, so what it cannot make of a change is not there; fit with --dense, and "
-            "give --set surfaces=dense."
+            "The surfaces are those of the model, so changes outside its span are missing; fit with --dense and pass "
+            "--set surfaces=dense."
         )

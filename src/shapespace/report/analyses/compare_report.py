@@ -96,7 +96,7 @@ def compare_report(result: CompareResult) -> AnalysisReport:
 
 
 def _summary(result: CompareResult) -> Iterator[str]:
-    """Yield the results of terms with their limits, what limits all of them, the sample, and then maps."""
+    """Yield the results of terms with their limits, warnings on all terms, the sample, and then maps."""
     shapes, kind = len(result.cohort), {"box-cox": "Box-Cox", "log": "log F"}[result.config.effect_size]
     for test in result.tests:
         figures = f"R² {100 * test.r2:.1f} %, F {test.f:.2f}, Z {test.z:.1f} by {kind}, {_p_text(test.p)}"
@@ -120,15 +120,15 @@ def _summary(result: CompareResult) -> Iterator[str]:
 
 
 def _limits(result: CompareResult, test: TermTest) -> str:
-    """Return what limits a test: the assumption on variances, with p under the other one, or that it is violated."""
+    """Return the assumption of a test on variances, with p under the other assumption, or that it is violated."""
     if test.unequal_variances:
         other = "" if test.p_other is None else f"; {_p_text(test.p_other)} with it"
         return f" without the assumption of equal variances{other}"
     named = set(test.term.split(":"))
     violated = [
-        one
-        for one in result.methods.dispersions
-        if one.stratum == test.stratum and one.variable in named and not one.equal
+        dispersion
+        for dispersion in result.methods.dispersions
+        if dispersion.stratum == test.stratum and dispersion.variable in named and not dispersion.equal
     ]
     if not violated:
         return ""
@@ -150,15 +150,15 @@ def compare_warnings(result: CompareResult) -> tuple[str, ...]:
         *_repeated_measures_warnings(result),
         *_uncentred_warnings(result),
         *(
-            f"Whether the changes {one.first} and {one.second} have one direction (angle {one.degrees:.0f}°) is not "
-            "known: neither is longer than its noise."
-            for one in result.angles
-            if one.unknown_p
+            f"It is not known whether the changes {angle.first} and {angle.second} have the same direction (angle "
+            f"{angle.degrees:.0f}°): neither is longer than its noise."
+            for angle in result.angles
+            if angle.unknown_p
         ),
         *(
-            f"{one.name} has {len(one.levels)} classes; pairs of the first {MOST_LEVELS} are compared."
-            for one in result.design.variables
-            if len(one.levels) > MOST_LEVELS and any(effect.name == one.name for effect in result.effects)
+            f"{variable.name} has {len(variable.levels)} classes; pairs of the first {MOST_LEVELS} are compared."
+            for variable in result.design.variables
+            if len(variable.levels) > MOST_LEVELS and any(effect.name == variable.name for effect in result.effects)
         ),
     )
 
@@ -169,8 +169,8 @@ def _subject_warnings(result: CompareResult) -> Iterator[str]:
         names = table.columns.get("subject", ())
         if all(names) and len(set(names)) < len(names):
             yield (
-                f"The {len(names)} shapes are of {len(set(names))} subjects and are taken for independent, which makes "
-                "differences look surer than they are; say --blocks subject."
+                f"The {len(names)} shapes are of {len(set(names))} subjects and are treated as independent, which "
+                "makes p values too small; pass --blocks subject."
             )
         return
     counts = Counter(table.texts(blocks))
@@ -205,22 +205,27 @@ def _repeated_measures_warnings(result: CompareResult) -> Iterator[str]:
     for effect, count in repeated.subjects_without_effect.items():
         yield (
             f"{count} of {result.n_subjects} {blocks}s lack conditions from which {effect} can be estimated, and "
-            "are left out of its test."
+            "are excluded from its test."
         )
 
 
 def _uncentred_warnings(result: CompareResult) -> Iterator[str]:
     design = result.design
-    for one in design.variables:
+    for variable in design.variables:
         # A function of the variable, such as center(age), defines its own zero.
         has_interaction = any(
-            one.column in term.variables and len(term.variables) > 1 and one.name in term.factors
+            variable.column in term.variables and len(term.variables) > 1 and variable.name in term.factors
             for term in design.terms
         )
-        if result.config.anova_type == "III" and has_interaction and not one.levels and one.low * one.high > 0:
+        if (
+            result.config.anova_type == "III"
+            and has_interaction
+            and not variable.levels
+            and variable.low * variable.high > 0
+        ):
             yield (
-                f"Type III tests what varies with {one.name} where {one.name} is 0, which lies outside the data; write "
-                f"center({one.name}) in the formula, or take type II."
+                f"Type III tests the effects that vary with {variable.name} at {variable.name} = 0, which lies outside "
+                f"the data; write center({variable.name}) in the formula, or use type II."
             )
 
 
@@ -294,7 +299,7 @@ def _p_text(p: float) -> str:
 
 
 def _near_landmark(cohort: Cohort, vertex: int) -> str:
-    """Return the name of the landmark next to a vertex, in words; nothing where there are none."""
+    """Return the name of the landmark next to a vertex, in words; empty if the cohort has no landmarks."""
     if not cohort.landmarks:
         return ""
     landmarks = cohort.landmarks.interpolate(cohort.reference)
@@ -316,18 +321,22 @@ def _term_table(result: CompareResult) -> ResultTable:
         for t in result.tests
     ]  # fmt: skip
     shown: list[int] = []
-    for one in result.strata:
-        shown += [k for k, test in enumerate(result.tests) if test.stratum == one.stratum]
+    for stratum in result.strata:
+        shown += [k for k, test in enumerate(result.tests) if test.stratum == stratum.stratum]
         shown += [len(rows), len(rows) + 1]
-        share, mean_square, unknown = one.squares / one.squares_total, one.squares / one.df, (*[None] * 6, "", None)
+        share, mean_square, unknown = (
+            stratum.squares / stratum.squares_total,
+            stratum.squares / stratum.df,
+            (*[None] * 6, "", None),
+        )
         rows += [
-            ("residual", one.stratum, one.df, one.squares, mean_square, share, share, *unknown),
-            ("total", one.stratum, one.df_total, one.squares_total, None, None, 1.0, *unknown),
+            ("residual", stratum.stratum, stratum.df, stratum.squares, mean_square, share, share, *unknown),
+            ("total", stratum.stratum, stratum.df_total, stratum.squares_total, None, None, 1.0, *unknown),
         ]
     other = "equal" if result.unequal_variances else "unequal"
     has_other = any(test.p_other is not None for test in result.tests)
     return ResultTable(
-        title="What shape varies with",
+        title="Analysis of variance",
         level=2,
         columns=(
             Column("term", field="term"), Column("tested" if strata else "", field="stratum"),
@@ -360,7 +369,7 @@ def _effect_table(result: CompareResult) -> ResultTable:
     pairs, lengths = Counter(effect.name for effect in result.effects), LengthFormat(result.cohort.unit)
     several = max(pairs.values(), default=0) > 1
     return ResultTable(
-        title="How far apart",
+        title="Distances between means",
         level=2,
         note="Distances of least-squares means: one variable changes, the others stay. The Procrustes distance is "
         "summed over vertices, the RMS is a vertex's share."
@@ -385,7 +394,7 @@ def _angle_tables(result: CompareResult) -> Iterator[ResultTable]:
         yield ResultTable(
             title="Angles between changes of shape",
             note="0° is the same change, 90° nothing in common, 180° the opposite; p is that of parallel changes"
-            f"{', not known where both are no longer than noise' if any(a.unknown_p for a in result.angles) else ''}.",
+            f"{', not known if both are no longer than noise' if any(a.unknown_p for a in result.angles) else ''}.",
             columns=(
                 Column("one", field="first"), Column("other", field="second"),
                 Column("angle, degrees", "number", "degrees"), Column("p", "p", "p"), Column(field="p_not_known"),
@@ -411,7 +420,7 @@ def _effect_parts(
             (f"Along the normal, family-wise error {level}", "normal_mm", "normal_family"),
             (f"Along the normal, false discovery rate {level}", "normal_mm", "normal_fdr"),
             (f"In any direction, family-wise error {level}", "length_mm", "length_family"),
-            (f"Bumps beside how shapes vary, family-wise error {level}", "bump_mm", "bump_family"),
+            (f"Bumps compared with the variation between shapes, family-wise error {level}", "bump_mm", "bump_family"),
         ):
             if values in arrays:
                 yield SurfaceMapPart(
@@ -451,23 +460,23 @@ def _f_sentence(result: CompareResult) -> str:
 
 
 def _score_parts(result: CompareResult, effect: ShapeEffect) -> Iterator[Part]:
-    """Yield regression scores against a number: shapes projected on what it changes."""
-    one = next((v for v in result.design.variables if v.name == effect.name and not v.levels), None)
+    """Yield the regression scores of a numeric variable: shapes projected on its effect."""
+    variable = next((v for v in result.design.variables if v.name == effect.name and not v.levels), None)
     length = float(np.linalg.norm(effect.change))
-    if one is None or length == 0:
+    if variable is None or length == 0:
         return
-    x = np.array(result.design.values[one.column], dtype=np.float64)
+    x = np.array(result.design.values[variable.column], dtype=np.float64)
     y = (result.cohort.coefficients - result.mean) @ effect.change / length
-    slope = length / (one.high - one.low)
-    ends = np.array([one.low, one.high])
+    slope = length / (variable.high - variable.low)
+    ends = np.array([variable.low, variable.high])
     yield CurvePart(
-        title=f"Regression score of {one.name}",
+        title=f"Regression score of {variable.name}",
         note="Each shape along the change of this page (Drake and Klingenberg, Proc. R. Soc. B 275, 2008).",
-        x=one.name,
+        x=variable.name,
         y=_lengths(result).label("score"),
         series=(
             Series(x=floats(x), y=floats(y), label="shapes", points=True),
-            Series(x=floats(ends), y=floats(slope * (ends - one.middle)), label="model"),
+            Series(x=floats(ends), y=floats(slope * (ends - variable.middle)), label="model"),
         ),
     )
 
@@ -477,7 +486,7 @@ def _exaggeration(result: CompareResult, effect: ShapeEffect) -> int:
     moved = float(np.linalg.norm((effect.change @ cohort.basis).reshape(-1, 3), axis=1).max()) or 1.0
     size = math.sqrt(float((cohort.reference - cohort.reference.mean(axis=0)).var(axis=0).sum()))
     share = _VECTOR_SHARE if cohort.faces is None and cohort.dimensions == 3 else _LARGEST_SHARE
-    return max((one for one in _EXAGGERATIONS if one * moved <= share * size), default=1)
+    return max((factor for factor in _EXAGGERATIONS if factor * moved <= share * size), default=1)
 
 
 def _arrays(result: CompareResult, effect: ShapeEffect) -> Mapping[str, npt.NDArray[Any]]:

@@ -31,7 +31,7 @@ _CITATIONS = (
 
 @dataclass(eq=False)
 class CompletionReport:
-    """Collects what the report shows of each completion, so that completions are not held in memory.
+    """Collects the content of the report on each completion, so that completions need not stay in memory.
 
     Args:
         config: settings of the completions.
@@ -94,7 +94,7 @@ class CompletionReport:
             title="Scans",
             columns=(
                 Column("scan", field="scan"), Column("status", field="status"),
-                *(Column(one, "percent", f"{one}_share") for one in ("observed", "estimated", "unknowable")),
+                *(Column(name, "percent", f"{name}_share") for name in ("observed", "estimated", "unknowable")),
                 Column("SD of missing vertices, mm", "number", "missing_stddev_mm"),
                 Column("noise, mm", "number", "noise_mm"),
             ),
@@ -142,7 +142,7 @@ class CompletionReport:
             "never": (),
             "combined": (
                 "Missing vertices were also moved towards the mirror image of the observed side, weighted by their "
-                "variance and by the asymmetry of pairs of which both sides were observed.",
+                "variance and by the asymmetry of pairs with two observed sides.",
             ),
             "alone": ("Missing vertices with an observed mirror image were taken from it.",),
         }[self.config.mirror]
@@ -162,8 +162,8 @@ class CompletionReport:
             "Intervals of quantities are cross-conformal (Barber et al. 2021)."
             if self._calibrated_on
             else "Intervals of quantities are those of the model.",
-            f"The {self.config.samples} samples of the whole shape (seed {self.config.seed}) are multiple imputations "
-            "(Rubin 1987).",
+            f"The {self.config.samples} samples of the complete shape (seed {self.config.seed}) are multiple "
+            "imputations (Rubin 1987).",
         )
 
     def _note(self, note: str, names: list[str], count: int) -> str:
@@ -216,8 +216,8 @@ class CompletionReport:
 
 
 def _source(calibrated_on: int) -> str:
-    """Return on what intervals are calibrated."""
-    return f"from {calibrated_on} training shapes left out in turn" if calibrated_on else "not calibrated"
+    """Return how intervals are calibrated."""
+    return f"from {calibrated_on} training shapes held out in turn" if calibrated_on else "not calibrated"
 
 
 def _number(value: float) -> str:

@@ -36,7 +36,7 @@ _INTERVALS = (
 
 
 def verify_report(result: VerificationResult) -> AnalysisReport:
-    """Return what `shapespace recognise verify` writes."""
+    """Return the report of `shapespace recognise verify`."""
     pairs, first = result.pairs, result.scores[0]
     genuine, impostor = int(pairs.same.sum()), int((~pairs.same).sum())
     rare = [far for far in FAR if impostor * far < _ERRORS]
@@ -44,24 +44,25 @@ def verify_report(result: VerificationResult) -> AnalysisReport:
         f"By {_score_label(first.name)} the equal error rate is {_percent_text(first.eer)}, over {genuine} pairs of "
         f"one subject and {impostor} pairs of two.",
         *(
-            f"At a false accept rate of {100 * far:g} % it accepts {_percent_text(one)} of the pairs of one subject."
-            for far, one in first.tar.items()
-            if one.value is not None
+            f"At a false accept rate of {100 * far:g} % it accepts {_percent_text(estimate)} of the pairs of one "
+            "subject."
+            for far, estimate in first.tar.items()
+            if estimate.value is not None
         ),
         ""
         if first.cllr.value is None
         else f"Its calibrated likelihood ratios miss {first.cllr.value:.3f} bits of 1 (Cllr), of which "
         f"{first.cllr_min:.3f} would be missed by the best calibration.",
         *(
-            f"By {_score_label(one.name)} the equal error rate is {_percent_text(one.eer)}."
-            for one in result.scores[1:]
+            f"By {_score_label(score.name)} the equal error rate is {_percent_text(score.eer)}."
+            for score in result.scores[1:]
         ),
     )
     notes = (
         _no_error_sentence((first.eer.value or 0.0) > 0, pairs.genuine_people),
         f"{impostor} pairs of two make {', '.join(f'{impostor * far:.1f}' for far in rare)} false accepts at a rate of "
-        f"{', '.join(f'{far:g}' for far in rare)}, and 30 are wanted for a rate to be trusted; below one nothing is "
-        "stated."
+        f"{', '.join(f'{far:g}' for far in rare)}, and 30 are needed for a reliable rate; with fewer than one no "
+        "rate is stated."
         if rare
         else "",
         "There are too few subjects to calibrate scores on subjects who are not tested, so there are no likelihood "
@@ -72,32 +73,32 @@ def verify_report(result: VerificationResult) -> AnalysisReport:
     arrays = {
         "rows": pairs.rows,
         "same": pairs.same,
-        **{f"score_{one.name}": one.score for one in result.scores},
-        **{f"llr_{one.name}": one.llr for one in result.scores if one.llr is not None},
+        **{f"score_{score.name}": score.score for score in result.scores},
+        **{f"llr_{score.name}": score.llr for score in result.scores if score.llr is not None},
     }
-    figures = [row for one in result.scores for row in _verification_rows(one)]
+    figures = [row for score in result.scores for row in _verification_rows(score)]
     return _identity_report(
         result, "verify", "Verification", summary, notes, _verification_parts(result), figures, {"pairs.npz": arrays}
     )
 
 
 def identify_report(result: IdentificationResult) -> AnalysisReport:
-    """Return what `shapespace recognise identify` writes."""
+    """Return the report of `shapespace recognise identify`."""
     first = result.scores[0]
     enrolled = first.searches.enrolled
-    unmeasured = ", ".join(f"{rate:g}" for rate, one in first.fnir.items() if one.value is None)
+    unmeasured = ", ".join(f"{rate:g}" for rate, estimate in first.fnir.items() if estimate.value is None)
     summary = (
         f"By {_score_label(first.name)} the right subject is the first of {result.enrolled} in "
         f"{_percent_text(first.rank_1)} of {result.probes - int((~enrolled).sum())} searches.",
         *(
             f"Where {100 * rate:g} % of searches for strangers may return a person, "
-            f"{_percent_text(one)} of those enrolled are missed."
-            for rate, one in first.fnir.items()
-            if one.value is not None
+            f"{_percent_text(estimate)} of those enrolled are missed."
+            for rate, estimate in first.fnir.items()
+            if estimate.value is not None
         ),
         *(
-            f"By {_score_label(one.name)} the right subject is the first in {_percent_text(one.rank_1)}."
-            for one in result.scores[1:]
+            f"By {_score_label(score.name)} the right subject is the first in {_percent_text(score.rank_1)}."
+            for score in result.scores[1:]
         ),
     )
     notes = (
@@ -108,11 +109,11 @@ def identify_report(result: IdentificationResult) -> AnalysisReport:
         else "",
     )
     arrays = {
-        f"{field}_{one.name}": getattr(one.searches, field)
-        for one in result.scores
+        f"{field}_{score.name}": getattr(score.searches, field)
+        for score in result.scores
         for field in ("rank", "own", "best_other")
     }
-    figures = [row for one in result.scores for row in _identification_rows(one)]
+    figures = [row for score in result.scores for row in _identification_rows(score)]
     return _identity_report(
         result, "identify", "Identification", summary, notes, _identification_parts(result), figures,
         {"searches.npz": arrays},
@@ -129,17 +130,21 @@ def _identity_report(
     figures: Sequence[Sequence[object]],
     arrays: Any,
 ) -> AnalysisReport:
-    """Return a report with what both commands have: the role of each scan, the methods and the settings.
+    """Return a report with the content that both commands share: the role of each scan, the methods and the settings.
 
     Empty sentences in `summary` and `notes` are omitted.
     """
     trial, config, trained_on = result.trial, result.config, result.trained_on
     role = dict.fromkeys(range(len(trial.cohort)), "train")
-    for one in trial.rounds:
-        role |= dict.fromkeys(one.gallery, "both" if trial.all_pairs else "gallery")
+    for trial_round in trial.rounds:
+        role |= dict.fromkeys(trial_round.gallery, "both" if trial.all_pairs else "gallery")
         if not trial.all_pairs:
-            role |= dict.fromkeys(one.probes, "probe")
-    used = {row for one in trial.rounds for row in (*one.training, *one.gallery, *one.probes)}
+            role |= dict.fromkeys(trial_round.probes, "probe")
+    used = {
+        row
+        for trial_round in trial.rounds
+        for row in (*trial_round.training, *trial_round.gallery, *trial_round.probes)
+    }
     # The order of `role` is that of the scans, since all of them are in it from the start.
     scans = [
         (name, subject, own if row in used else "")
@@ -167,29 +172,29 @@ def _identity_report(
 
 
 def _score_label(name: str) -> str:
-    """Return what a score is called in words."""
+    """Return the name of a score in words."""
     return _SCORE_NAMES.get(name, name)
 
 
-def _percent_text(one: RateEstimate) -> str:
+def _percent_text(estimate: RateEstimate) -> str:
     """Return a share with its interval in words."""
-    if one.value is None:
+    if estimate.value is None:
         return "not known"
-    ends = _interval(one)
-    return f"{100 * one.value:.2f} %" + (f" (95 %: {100 * ends[0]:.2f} to {100 * ends[1]:.2f} %)" if ends else "")
+    ends = _interval(estimate)
+    return f"{100 * estimate.value:.2f} %" + (f" (95 %: {100 * ends[0]:.2f} to {100 * ends[1]:.2f} %)" if ends else "")
 
 
-def _interval(one: RateEstimate) -> tuple[float, float] | None:
+def _interval(estimate: RateEstimate) -> tuple[float, float] | None:
     """Return the ends of an interval, or None if there is none."""
-    return None if one.low is None or one.high is None else (one.low, one.high)
+    return None if estimate.low is None or estimate.high is None else (estimate.low, estimate.high)
 
 
-def _cells(one: RateEstimate) -> tuple[float | None, float | None, float | None]:
-    return one.value, one.low, one.high
+def _cells(estimate: RateEstimate) -> tuple[float | None, float | None, float | None]:
+    return estimate.value, estimate.low, estimate.high
 
 
 def _cells_with_intervals(estimates: Iterable[RateEstimate]) -> tuple[object, ...]:
-    return tuple(cell for one in estimates for cell in (one.value, _interval(one)))
+    return tuple(cell for estimate in estimates for cell in (estimate.value, _interval(estimate)))
 
 
 def _thin_curve(x: FloatArray, y: FloatArray, label: str) -> Series:
@@ -203,7 +208,7 @@ def _thin_curve(x: FloatArray, y: FloatArray, label: str) -> Series:
 
 
 def _subjects_sentence(trial: Trial, trained_on: int) -> str:
-    """Return in words who was compared, and who was learned from."""
+    """Return a sentence on the tested subjects and on those of the training set."""
     tested = int(trial.tested.sum())
     training = f"on {trained_on} other subjects" if trained_on else "on no subjects"
     if len(trial.rounds) == 1:
@@ -225,12 +230,12 @@ def _no_error_sentence(errors: bool, people: int) -> str:
     )
 
 
-def _identification_rows(one: IdentificationRates) -> list[Sequence[object]]:
-    ranks = enumerate(zip(one.cmc.tolist(), *one.band.tolist(), strict=True), 1)
+def _identification_rows(rates: IdentificationRates) -> list[Sequence[object]]:
+    ranks = enumerate(zip(rates.cmc.tolist(), *rates.band.tolist(), strict=True), 1)
     return [
-        [one.name, "rank 1", *_cells(one.rank_1)],
-        *([one.name, f"within {k}", share, *ends] for k, (share, *ends) in ranks),
-        *([one.name, f"fnir at fpir {rate:g}", *_cells(estimate)] for rate, estimate in one.fnir.items()),
+        [rates.name, "rank 1", *_cells(rates.rank_1)],
+        *([rates.name, f"within {k}", share, *ends] for k, (share, *ends) in ranks),
+        *([rates.name, f"fnir at fpir {rate:g}", *_cells(estimate)] for rate, estimate in rates.fnir.items()),
     ]
 
 
@@ -238,7 +243,8 @@ def _identification_parts(result: IdentificationResult) -> tuple[Part, ...]:
     rates = ["first", *(f"FNIR at FPIR {rate:g}" for rate in result.scores[0].fnir)]
     columns = ["score", *(name for rate in rates for name in (rate, "95 %"))]
     rows = tuple(
-        (_score_label(one.name), *_cells_with_intervals((one.rank_1, *one.fnir.values()))) for one in result.scores
+        (_score_label(score.name), *_cells_with_intervals((score.rank_1, *score.fnir.values())))
+        for score in result.scores
     )
     ranks = tuple(float(k) for k in range(1, result.enrolled + 1))
     return (
@@ -251,9 +257,9 @@ def _identification_parts(result: IdentificationResult) -> tuple[Part, ...]:
             title="CMC curve",
             note="Share of probes whose subject is within the first ranks.",
             series=tuple(
-                Series(x=ranks, y=tuple(one.cmc.tolist()), label=_score_label(one.name),
-                       low=tuple(one.band[0].tolist()), high=tuple(one.band[1].tolist()))
-                for one in result.scores
+                Series(x=ranks, y=tuple(score.cmc.tolist()), label=_score_label(score.name),
+                       low=tuple(score.band[0].tolist()), high=tuple(score.band[1].tolist()))
+                for score in result.scores
             ),
             x="rank",
             y="share of searches",
@@ -271,42 +277,42 @@ def _identification_parts(result: IdentificationResult) -> tuple[Part, ...]:
     )  # fmt: skip
 
 
-def _verification_rows(one: VerificationRates) -> Iterator[Sequence[object]]:
-    yield one.name, "eer", *_cells(one.eer)
-    yield from ((one.name, f"tar at far {far:g}", *_cells(estimate)) for far, estimate in one.tar.items())
-    yield one.name, "cllr", *_cells(one.cllr)
-    yield one.name, "cllr_min", one.cllr_min, None, None
-    yield from ((one.name, f"eer with {modes} modes", eer, None, None) for modes, eer in one.curve.items())
-    for value, part in one.by.items():
-        yield one.name, f"eer of {value}", *_cells(part.eer)
+def _verification_rows(rates: VerificationRates) -> Iterator[Sequence[object]]:
+    yield rates.name, "eer", *_cells(rates.eer)
+    yield from ((rates.name, f"tar at far {far:g}", *_cells(estimate)) for far, estimate in rates.tar.items())
+    yield rates.name, "cllr", *_cells(rates.cllr)
+    yield rates.name, "cllr_min", rates.cllr_min, None, None
+    yield from ((rates.name, f"eer with {modes} modes", eer, None, None) for modes, eer in rates.curve.items())
+    for value, part in rates.by.items():
+        yield rates.name, f"eer of {value}", *_cells(part.eer)
         for far, estimate in part.tar.items():
-            yield one.name, f"tar at far {far:g} of {value}", *_cells(estimate)
+            yield rates.name, f"tar at far {far:g} of {value}", *_cells(estimate)
 
 
 def _verification_parts(result: VerificationResult) -> Iterator[Part]:
     yield from (_rates_table(result), _det_curve(result), _roc_curve(result))
-    if any(one.curve for one in result.scores):
+    if any(score.curve for score in result.scores):
         yield CurvePart(
             title="Equal error rate by the number of modes",
-            note="Leading coefficients of identity; the plain distance uses the whole shapes.",
+            note="Leading coefficients of identity; the plain distance uses complete shapes.",
             series=tuple(
-                Series(x=tuple(map(float, one.curve)), y=tuple(one.curve.values()), label=_score_label(one.name))
-                for one in result.scores
+                Series(x=tuple(map(float, score.curve)), y=tuple(score.curve.values()), label=_score_label(score.name))
+                for score in result.scores
             ),
             x="modes",
             y="equal error rate",
             x_scale="log",
         )
-    if any(one.by for one in result.scores):
+    if any(score.by for score in result.scores):
         yield _subgroup_table(result)
-    yield from (_histogram(one, result) for one in result.scores[:2])
+    yield from (_histogram(score, result) for score in result.scores[:2])
     yield TextPart(
         title="How it was measured",
         text=(
             _subjects_sentence(result.trial, result.trained_on),
             f"{_INTERVALS} Scores, PLDA scores among them, are not likelihood ratios until they are calibrated, by a "
-            "logistic regression on pairs of subjects of other groups. Whether the shape model was built from subjects "
-            "tested here cannot be seen from its file; it must not have been.",
+            "logistic regression on pairs of subjects of other groups. The shape model must not have been built from "
+            "the subjects tested here; its file does not show whether it was.",
         ),
     )
 
@@ -315,13 +321,19 @@ def _rates_table(result: VerificationResult) -> TablePart:
     rates = ["EER", *(f"TAR at FAR {far:g}" for far in FAR)]
     columns = ["score", *(name for rate in rates for name in (rate, "95 %")), "Cllr, bits", "Cllr-min, bits"]
     rows = tuple(
-        (_score_label(one.name), *_cells_with_intervals((one.eer, *one.tar.values())), one.cllr.value, one.cllr_min)
-        for one in result.scores
+        (
+            _score_label(score.name),
+            *_cells_with_intervals((score.eer, *score.tar.values())),
+            score.cllr.value,
+            score.cllr_min,
+        )
+        for score in result.scores
     )
     return TablePart.of(
         "Verification rates", columns, rows, percent=rates,
         note="EER: error rate where false rejection and false acceptance are equal. TAR: pairs of one subject "
-        "accepted, at a rate FAR of pairs of two accepted. Cllr: what the likelihood ratios miss, 0 to 1 and more.",
+        "accepted, at a rate FAR of pairs of two accepted. Cllr: bits that the likelihood ratios lose, 0 to 1 and "
+        "more.",
     )  # fmt: skip
 
 
@@ -330,13 +342,13 @@ def _det_curve(result: VerificationResult) -> CurvePart:
     # A rate of 0 has no place on this scale, and a score without an error would have no line.
     ends = [0.5 / (len(result.pairs) - genuine), 0.5 / genuine]
     series: list[Series] = []
-    for one in result.scores:
-        rates = (one.roc.far[1:-1], 1 - one.roc.tar[1:-1])
+    for score in result.scores:
+        rates = (score.roc.far[1:-1], 1 - score.roc.tar[1:-1])
         far, missed = (np.clip(rate, end, 1 - end) for rate, end in zip(rates, ends, strict=True))
-        series.append(_thin_curve(far, missed, _score_label(one.name)))
+        series.append(_thin_curve(far, missed, _score_label(score.name)))
     return CurvePart(
         title="DET curve",
-        note="Both errors at their normal deviates; none at all stands at half a pair.",
+        note="Both error rates as normal deviates; a rate of zero is drawn at half a pair.",
         series=tuple(series),
         x="false accept rate",
         y="false reject rate",
@@ -349,16 +361,16 @@ def _det_curve(result: VerificationResult) -> CurvePart:
 def _roc_curve(result: VerificationResult) -> CurvePart:
     least = max(1.0 / int((~result.pairs.same).sum()), _LEAST_RATE)
     series: list[Series] = []
-    for one in result.scores:
+    for score in result.scores:
         far = np.unique(np.concatenate([[least], GRID[least <= GRID]]))
         grid_points = np.searchsorted(GRID, far)
-        band = [tuple(side[np.minimum(grid_points, len(GRID) - 1)].tolist()) for side in one.band]
-        has_band = bool(np.isfinite(one.band).all())
+        band = [tuple(side[np.minimum(grid_points, len(GRID) - 1)].tolist()) for side in score.band]
+        has_band = bool(np.isfinite(score.band).all())
         series.append(
             Series(
                 x=tuple(far.tolist()),
-                y=tuple(one.roc.tar_at(far).tolist()),
-                label=_score_label(one.name),
+                y=tuple(score.roc.tar_at(far).tolist()),
+                label=_score_label(score.name),
                 low=band[0] if has_band else None,
                 high=band[1] if has_band else None,
             )
@@ -372,24 +384,25 @@ def _subgroup_table(result: VerificationResult) -> TablePart:
     rates = ("EER", "TAR at FAR 0.01")
     columns = (result.config.by or "", "score", "pairs of one", "pairs of two", rates[0], "95 %", rates[1], "95 %")
     rows = [
-        (value, _score_label(one.name), part.genuine, part.impostor, *_cells_with_intervals((part.eer, part.tar[1e-2])))
+        (value, _score_label(score.name), part.genuine, part.impostor,
+         *_cells_with_intervals((part.eer, part.tar[1e-2])))
         for value in (result.scores[0].by)
-        for one in result.scores
-        for part in (one.by[value],)
+        for score in result.scores
+        for part in (score.by[value],)
     ]  # fmt: skip
     return TablePart.of(f"By {result.config.by}", columns, rows, percent=rates)
 
 
-def _histogram(one: VerificationRates, result: VerificationResult) -> HistogramPart:
-    values = one.score if one.llr is None else one.llr / np.log(10.0)
+def _histogram(rates: VerificationRates, result: VerificationResult) -> HistogramPart:
+    values = rates.score if rates.llr is None else rates.llr / np.log(10.0)
     edges = np.linspace(float(values.min()), float(values.max()) + 1e-12, _BINS + 1)
     same = result.pairs.same
     return histogram_part(
-        f"Scores: {_score_label(one.name)}",
+        f"Scores: {_score_label(rates.name)}",
         {"one subject": values[same], "two subjects": values[~same]},
         edges,
         shares=True,
         note="Shares of each kind of pair.",
-        x="score" if one.llr is None else "calibrated likelihood ratio, powers of ten",
+        x="score" if rates.llr is None else "calibrated likelihood ratio, powers of ten",
         y="share",
     )

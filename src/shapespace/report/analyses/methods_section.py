@@ -77,7 +77,7 @@ _OF_QUESTION = {
 
 
 def points_word(methods: Methods) -> str:
-    """Return what the points of a shape are called."""
+    """Return the word for the points of a shape."""
     return "landmarks" if methods.source == "landmarks" else "vertices"
 
 
@@ -85,7 +85,7 @@ def methods_text(analysis: Analysis) -> str:
     """Return methods.txt: a paragraph for a methods section, and its references.
 
     Args:
-        analysis: with the record of its methods.
+        analysis: analysis with the record of its methods.
     """
     methods = analysis.methods
     if methods is None:
@@ -125,14 +125,14 @@ def citations_of(analysis: Analysis) -> tuple[str, ...]:
         _EFFECT_SIZE if methods.effect_size else (),
         analysis.citations,
     )
-    return tuple(dict.fromkeys(one for group in groups for one in group))
+    return tuple(dict.fromkeys(citation for group in groups for citation in group))
 
 
 def alignment_text(record: AlignRecord) -> str:
     """Return methods.txt of an alignment of landmarks.
 
     Args:
-        record: of the alignment.
+        record: record of the alignment.
     """
     settings = record.settings
     curves, surface = (int(settings.get(f"{kind}_semilandmarks") or 0) for kind in ("curve", "surface"))
@@ -172,7 +172,7 @@ def _paragraph(sentences: Sequence[str], references: Sequence[str]) -> str:
 
 def _value_text(value: object) -> str:
     if isinstance(value, Mapping):
-        return ", ".join(f"{key} = {one}" for key, one in cast(Mapping[object, object], value).items())
+        return ", ".join(f"{key} = {entry}" for key, entry in cast(Mapping[object, object], value).items())
     if isinstance(value, list | tuple):
         return ", ".join(map(str, cast(Sequence[object], value)))
     return "yes" if value is True else f"{value:g}" if isinstance(value, float) else str(value)
@@ -205,14 +205,15 @@ def methods_parts(methods: Methods) -> Iterator[Part]:
     yield TextPart(title="Methods", level=2, text=tuple(_sentences(methods)))
     if methods.sizes:
         sizes = [
-            (" × ".join(one.variables), " × ".join(one.classes), one.subjects, one.shapes) for one in methods.sizes
+            (" × ".join(size.variables), " × ".join(size.classes), size.subjects, size.shapes) for size in methods.sizes
         ]
         yield TablePart.of("Sample sizes", ("variable", "class", "subjects", "shapes"), sizes)
     if methods.tests:
         yield TablePart.of(
             "Tests", ("tested", "stratum", "statistic", "p by", "arrangements"),
-            [(", ".join(one.tested), one.stratum or "all", one.statistic, scheme_text(one), one.arrangements or None)
-             for one in methods.tests],
+            [(", ".join(test.tested), test.stratum or "all", test.statistic, scheme_text(test),
+              test.arrangements or None)
+             for test in methods.tests],
             note="The observed data are one of the arrangements of a permutation or of sign flips.",
         )  # fmt: skip
     if methods.dispersions:
@@ -220,9 +221,11 @@ def methods_parts(methods: Methods) -> Iterator[Part]:
         yield TablePart.of(
             "Equal dispersion of groups",
             ("variable", "stratum", "class", "n", f"standard deviation{unit}", "F", "p"),
-            [(one.variable, one.stratum or "all", group, count, stddev, *((one.f, one.p) if not k else (None, None)))
-             for one in methods.dispersions
-             for k, (group, count, stddev) in enumerate(zip(one.groups, one.counts, one.stddev, strict=True))],
+            [(dispersion.variable, dispersion.stratum or "all", group, count, stddev,
+              *((dispersion.f, dispersion.p) if not k else (None, None)))
+             for dispersion in methods.dispersions
+             for k, (group, count, stddev) in enumerate(
+                 zip(dispersion.groups, dispersion.counts, dispersion.stddev, strict=True))],
             note="Standard deviations of shapes about the mean of their class, root mean square over vertices; p by "
             "permutation of the distances to the class mean, corrected for the size of the class.",
         )  # fmt: skip
@@ -255,13 +258,17 @@ def _sentences(methods: Methods, *, in_paper: bool = False) -> Iterator[str]:
         yield f"Exchangeability: {_exchangeability(methods)}"
     if in_paper and methods.dispersions:
         tests = [
-            f"{one.variable}{f' {one.stratum}' if one.stratum else ''} (p = {one.p:.3g})" for one in methods.dispersions
+            f"{dispersion.variable}{f' {dispersion.stratum}' if dispersion.stratum else ''} (p = {dispersion.p:.3g})"
+            for dispersion in methods.dispersions
         ]
         yield f"Equal dispersion was tested by permutation of distances to class means: {', '.join(tests)}."
     elif methods.dispersions:
-        yield from (dispersion_sentence(one, methods.unequal_variances, methods.unit) for one in methods.dispersions)
+        yield from (
+            dispersion_sentence(dispersion, methods.unequal_variances, methods.unit)
+            for dispersion in methods.dispersions
+        )
     if methods.r2_strata is not None:
-        strata = [one for one in methods.r2_strata if one]
+        strata = [stratum for stratum in methods.r2_strata if stratum]
         yield (
             f"R² is the share of the total sum of squares of the stratum of the term ({', '.join(strata)}), not of all "
             "shapes."
@@ -296,7 +303,7 @@ def _exchangeability(methods: Methods) -> str:
     permuted = [test for test in equal if test.resampling == "permutation"]
     sentences: list[str] = []
     if permuted and not methods.sizes and all(test.reduced_model is None for test in permuted):
-        sentences.append("permutation assumes that what is permuted is exchangeable under the null hypothesis")
+        sentences.append("permutation assumes that the permuted units are exchangeable under the null hypothesis")
     elif permuted:
         sentences.append(
             "permutation assumes that the residuals have the same distribution in all groups, with equal dispersion"
@@ -314,13 +321,13 @@ def _exchangeability(methods: Methods) -> str:
 
 
 def scheme_text(test: TestScheme) -> str:
-    """Return how the p value of a test was computed."""
+    """Return the method of the p value of a test, in words."""
     if test.resampling == "none":
         return "its distribution"
     if test.resampling == "bootstrap":
         return f"bootstrap of {test.unit}s"
     if test.resampling == "leave-one-out":
-        return f"leaving out each {test.unit} of the reference"
+        return f"leave-one-out over the {_plural(test.unit)} of the reference"
     every = ", all of them" if test.exhaustive else ""
     difference, _, block = test.unit.partition(" within a ")
     within = f" within {_plural(block)}" if block else ""
@@ -351,26 +358,26 @@ def _plural(unit: str) -> str:
     return f"{noun}s{of}{rest}"
 
 
-def dispersion_sentence(one: Dispersion, unequal_variances: bool | None, unit: str) -> str:
-    """Return whether the classes of a variable are equally variable, and what follows if they are not.
+def dispersion_sentence(dispersion: Dispersion, unequal_variances: bool | None, unit: str) -> str:
+    """Return whether the classes of a variable are equally variable, and the consequence if they are not.
 
     Args:
-        one: the test.
+        dispersion: test of equal dispersion.
         unequal_variances: whether the tests of means allow unequal dispersion.
-        unit: of lengths.
+        unit: unit of lengths; empty if the coordinates have no unit.
     """
     named = ", ".join(
         f"{group} {stddev:.3g}{f' {unit}' if unit else ''} (n = {count})"
-        for group, count, stddev in zip(one.groups, one.counts, one.stddev, strict=True)
+        for group, count, stddev in zip(dispersion.groups, dispersion.counts, dispersion.stddev, strict=True)
     )
-    where = f" {one.stratum}" if one.stratum else ""
-    details = f"standard deviations by {one.variable}{where}: {named}; p = {one.p:.3g}"
-    if unequal_variances and min(one.counts) < FEWEST_OF_GROUP:
+    where = f" {dispersion.stratum}" if dispersion.stratum else ""
+    details = f"standard deviations by {dispersion.variable}{where}: {named}; p = {dispersion.p:.3g}"
+    if unequal_variances and min(dispersion.counts) < FEWEST_OF_GROUP:
         return (
-            f"Warning: {one.variable}{where} has a class of {min(one.counts)} subjects; with fewer than "
+            f"Warning: {dispersion.variable}{where} has a class of {min(dispersion.counts)} subjects; with fewer than "
             f"{FEWEST_OF_GROUP} the test with unequal variances is cautious and finds few differences ({details})."
         )
-    if one.equal:
+    if dispersion.equal:
         return f"No significant difference of dispersion ({details})."
     if unequal_variances:
         return f"Dispersion is unequal ({details}); the tests of means allow for it."
@@ -378,25 +385,25 @@ def dispersion_sentence(one: Dispersion, unequal_variances: bool | None, unit: s
         True: "differences are found that do not exist",
         False: "differences are missed",
         None: "they also respond to differences of dispersion",
-    }[one.smaller_is_more_variable]
+    }[dispersion.smaller_is_more_variable]
     return (
-        f"Warning: dispersion is unequal ({details}): p values of means are {bias_of_p(one)}, and {effect}. Use "
+        f"Warning: dispersion is unequal ({details}): p values of means are {bias_of_p(dispersion)}, and {effect}. Use "
         "--variances unequal."
     )
 
 
-def bias_of_p(one: Dispersion) -> str:
+def bias_of_p(dispersion: Dispersion) -> str:
     """Return how unequal dispersion changes p values of means that assume equal variances."""
-    return {True: "too small", False: "too large", None: "approximate"}[one.smaller_is_more_variable]
+    return {True: "too small", False: "too large", None: "approximate"}[dispersion.smaller_is_more_variable]
 
 
-def is_dispersion_warning(one: Dispersion, *, unequal_variances: bool) -> bool:
+def is_dispersion_warning(dispersion: Dispersion, *, unequal_variances: bool) -> bool:
     """Return whether the dispersion or the size of classes makes the p values of means doubtful."""
-    return min(one.counts) < FEWEST_OF_GROUP if unequal_variances else not one.equal
+    return min(dispersion.counts) < FEWEST_OF_GROUP if unequal_variances else not dispersion.equal
 
 
 def effect_size_sentence(kind: str) -> str:
-    """Return what Z is."""
+    """Return the definition of the effect size Z, in words."""
     if kind == "log":
         return "Z is log F in standard deviations above the mean of its arrangements (RRPP before version 0.6)."
     return (

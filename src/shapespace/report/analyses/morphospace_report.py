@@ -39,12 +39,12 @@ _SHARES: Mapping[OrdinationMethod, str] = {
     "cva": "variance between groups relative to that within groups",
     "paca": "variance along the aligned components",
 }
-"""What shares of axes refer to, where it is not the variance of the shapes."""
+"""Reference of the shares of axes, if it is not the variance of the shapes."""
 _CITATIONS: Mapping[OrdinationMethod, tuple[str, ...]] = {
     "pca": (),
     "between-groups": (
-        "Cardini A., O'Higgins P., Rohlf F. J. (2019) Seeing distinct groups where there are none: spurious patterns "
-        "from between-group PCA. Evolutionary Biology 46, 303-316.",
+        "Cardini A., O'Higgins P., Rohlf F. J. (2019) Seeing distinct groups where "
+        "there are none: spurious patterns from between-group PCA. Evolutionary Biology 46, 303-316.",
     ),
     "cva": (
         "Campbell N. A., Atchley W. R. (1981) The geometry of canonical variate analysis. Systematic Zoology 30, "
@@ -103,15 +103,17 @@ def morphospace_report(result: Ordination, first: tuple[int, int] = (1, 2)) -> A
 
 def compared_morphospace(result: CompareResult) -> tuple[MorphospacePart, dict[str, npt.NDArray[Any]]]:
     """Return the plot of the shapes of a comparison by its first variable with classes, and its arrays."""
-    variables = [one.name for one in result.design.variables if one.levels]
-    columns = [name for one in variables for name in result.cohort.table.columns if one in (name, f"C({name})")]
+    variables = [variable.name for variable in result.design.variables if variable.levels]
+    columns = [
+        name for variable in variables for name in result.cohort.table.columns if variable in (name, f"C({name})")
+    ]
     return morphospace_part(ordinate(result.cohort, group=tuple(columns[:1])))
 
 
 def morphospace_part(
     result: Ordination, first: tuple[int, int] = (1, 2)
 ) -> tuple[MorphospacePart, dict[str, npt.NDArray[Any]]]:
-    """Return the plot of an ordination, and the arrays of its file, `FILE`; arguments as of `morphospace_report`.
+    """Return the plot of an ordination, and the arrays of its file, `FILE`; see `morphospace_report` for the arguments.
 
     An ordination with one axis is drawn against the first principal component of the residuals.
     """

@@ -45,7 +45,7 @@ _MEASURE_NAMES = {
 
 
 def regression_report(result: RegressionResult, new: tuple[Cohort, Predictions] | None = None) -> AnalysisReport:
-    """Return the answer to what number goes with a shape, with what is predicted of new shapes."""
+    """Return the report of a regression on shape, with predictions of new shapes."""
     pictures, arrays, meshes = shape_prediction_parts(result.shapes)
     return cohort_report(
         "regress",
@@ -71,7 +71,7 @@ def regression_report(result: RegressionResult, new: tuple[Cohort, Predictions] 
 
 
 def prediction_report(predictor: Predictor, cohort: Cohort, predictions: Predictions) -> AnalysisReport:
-    """Return the answer of a predictor that was learned earlier."""
+    """Return the report of predictions by a saved predictor."""
     assumption = (
         f"{predictor.target} is predicted by {predictor.method}, learned from {predictor.subjects} other "
         f"subjects, with prediction intervals of {100 * predictor.confidence:.0f} % by cross-validation (CV+)."
@@ -98,8 +98,8 @@ def prediction_report(predictor: Predictor, cohort: Cohort, predictions: Predict
 def _summary(result: RegressionResult, new: tuple[Cohort, Predictions] | None) -> Iterator[str]:
     m, level = result.measures, f"{100 * result.confidence:.0f} %"
     yield (
-        f"Shape predicts {result.target} of subjects left out with an RMSE of {m['rmse'].value:.3g} "
-        f"({level} interval {_interval_text(m['rmse'])}), beside {result.baseline_rmse:.3g} by the mean alone: "
+        f"Shape predicts {result.target} of held-out subjects with an RMSE of {m['rmse'].value:.3g} "
+        f"({level} interval {_interval_text(m['rmse'])}), compared with {result.baseline_rmse:.3g} by the mean alone: "
         f"R² = {m['r2'].value:.2f} ({_interval_text(m['r2'])})"
         + ("." if result.p is None else f", p = {result.p:.2g}.")
     )
@@ -109,9 +109,9 @@ def _summary(result: RegressionResult, new: tuple[Cohort, Predictions] | None) -
             "within the intervals stated."
         )
     yield (
-        f"{level} intervals are {m['width'].value:.3g} wide on average, and hold {100 * m['coverage'].value:.0f} % of "
-        f"the subjects left out; the observed rises by {m['slope'].value:.2f} ({_interval_text(m['slope'])}) for "
-        "one predicted."
+        f"{level} intervals are {m['width'].value:.3g} wide on average, and contain {100 * m['coverage'].value:.0f} % "
+        f"of the held-out subjects; the observed value rises by {m['slope'].value:.2f} "
+        f"({_interval_text(m['slope'])}) per unit of the predicted value."
     )
     yield (
         f"The predictor uses {result.choice.words()}, {result.effective:.1f} degrees of freedom for "
@@ -140,9 +140,9 @@ def _summary(result: RegressionResult, new: tuple[Cohort, Predictions] | None) -
 def _outside_sentence(predictor: Predictor, predictions: Predictions) -> str:
     outside = [name for name, reason in zip(predictions.names, predictions.outside, strict=True) if reason]
     if not outside:
-        return "All lie within what was learned from."
-    return f"{len(outside)} of {len(predictions.names)} lie outside what was learned from ({outside[0]}: " + (
-        f"{next(reason for reason in predictions.outside if reason)}), and what is predicted of them is a guess."
+        return "All lie within the training data."
+    return f"{len(outside)} of {len(predictions.names)} lie outside the training data ({outside[0]}: " + (
+        f"{next(reason for reason in predictions.outside if reason)}), and their predictions are guesses."
     )
 
 
@@ -151,7 +151,7 @@ def _interval_text(measure: AccuracyMeasure) -> str:
 
 
 def _observed_target(cohort: Cohort, target: str) -> Any:
-    """Return the target of new shapes where all of them have it, else None."""
+    """Return the target of new shapes if all of them have it, else None."""
     if target not in cohort.table.columns:
         return None
     values = cohort.table.numbers(target)
@@ -168,7 +168,7 @@ def _measures_part(result: RegressionResult) -> TablePart:
     if result.p is not None:
         rows.append(("p of R², by permutation", result.p, None, None))
     return TablePart.of(
-        "On subjects left out", ("measure", "value", "low", "high"), rows,
+        "On held-out subjects", ("measure", "value", "low", "high"), rows,
         note=f"Nested cross-validation in {result.folds} folds of subjects, each of whom counts once; {level} "
         "intervals by bootstrap of subjects.",
     )  # fmt: skip
@@ -179,7 +179,7 @@ def _calibration_part(result: RegressionResult) -> CurvePart:
     x = result.predicted[order]
     slope, intercept = result.measures["slope"].value, result.measures["intercept"].value
     ends = np.array([x[0], x[-1]])
-    rows = Series(x=tuple(x.tolist()), y=tuple(result.observed[order].tolist()), label="subjects left out", points=True)
+    rows = Series(x=tuple(x.tolist()), y=tuple(result.observed[order].tolist()), label="held-out subjects", points=True)
     line = Series(x=tuple(ends.tolist()), y=tuple((intercept + slope * ends).tolist()), label="observed on predicted")
     return CurvePart(
         title="Calibration", series=(rows, line) if np.isfinite(slope) else (rows,), x=f"{result.target} predicted",
@@ -214,7 +214,7 @@ def _new_tables(predictor: Predictor, new: tuple[Cohort, Predictions] | None) ->
         rows=list(
             zip(new[0].names, predictions.value, predictions.low, predictions.high, predictions.outside, strict=True)
         ),
-        note=f"With {100 * predictor.confidence:.0f} % intervals; all of them stand in new.csv.",
+        note=f"With {100 * predictor.confidence:.0f} % intervals; all predictions are in new.csv.",
         file="new.csv",
         shown=range(_MOST_ROWS),
     )
@@ -347,10 +347,10 @@ def _value_table(result: ShapePrediction) -> ResultTable:
     names = ["distance_from_first", "standard_error", "half_width"]
     widths = [np.linalg.norm(result.half_width_mm(k)) for k in range(len(result.values))]
     columns = [result.distance_mm, result.distance_std_mm, np.array(widths) / result.cohort.n_vertices**0.5]
-    for one in result.measures:
-        name = re.sub(r"\W+", "_", one.name)
+    for measure in result.measures:
+        name = re.sub(r"\W+", "_", measure.name)
         names += [name, f"{name}_low", f"{name}_high"]
-        columns += [one.value, one.low, one.high]
+        columns += [measure.value, measure.low, measure.high]
     return ResultTable(
         title=f"Mean shapes along {result.along}", level=2, file="shapes.csv",
         columns=(Column(result.along, "number", result.along),
@@ -362,13 +362,13 @@ def _value_table(result: ShapePrediction) -> ResultTable:
 
 
 def _measure_parts(result: ShapePrediction) -> Iterator[Part]:
-    for one in result.measures:
-        low, high = ([None if np.isnan(v) else float(v) for v in end] for end in (one.low, one.high))
+    for measure in result.measures:
+        low, high = ([None if np.isnan(v) else float(v) for v in end] for end in (measure.low, measure.high))
         yield CurvePart(
-            title=f"{one.name.capitalize()} along {result.along}", x=result.along,
-            y=LengthFormat(result.cohort.unit).label(one.name),
-            series=(Series(x=floats(result.observed), y=floats(one.observed), label="shapes", points=True),
-                    Series(x=floats(result.values), y=floats(one.value), label="mean", low=tuple(low),
+            title=f"{measure.name.capitalize()} along {result.along}", x=result.along,
+            y=LengthFormat(result.cohort.unit).label(measure.name),
+            series=(Series(x=floats(result.observed), y=floats(measure.observed), label="shapes", points=True),
+                    Series(x=floats(result.values), y=floats(measure.value), label="mean", low=tuple(low),
                            high=tuple(high))),
         )  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""The report of a test of shape, the same for all of them, and report and files of the result of any analysis."""
+"""Report of any test of shape, and report and files of the result of any analysis."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ def shape_test_report(result: ShapeTestResult) -> AnalysisReport:
     summary = result.test.summary
     files = [
         ResultTable.of_fields(
-            f"{re.sub(r'[^a-z0-9]+', '_', (one.title or 'table').lower()).strip('_')}.csv",
-            [own.name for own in one.columns],
-            one.rows,
+            f"{re.sub(r'[^a-z0-9]+', '_', (table.title or 'table').lower()).strip('_')}.csv",
+            [own.name for own in table.columns],
+            table.rows,
         )
-        for one in result.tables
+        for table in result.tables
     ]
     return cohort_report(
         f"test {result.test.name}",
@@ -65,39 +65,39 @@ def shape_test_report(result: ShapeTestResult) -> AnalysisReport:
 
 
 def _sentences(result: ShapeTestResult) -> Iterator[str]:
-    for one in result.statistics[:_MOST_SENTENCES]:
-        yield f"{_sentence(one, result.level)}."
+    for statistic in result.statistics[:_MOST_SENTENCES]:
+        yield f"{_sentence(statistic, result.level)}."
     if len(result.statistics) > _MOST_SENTENCES:
         yield f"{len(result.statistics) - _MOST_SENTENCES} further statistics are in the table."
     unit = result.cohort.unit
-    if unit and any(_HAS_UNIT.search(one.name) for one in result.statistics):
+    if unit and any(_HAS_UNIT.search(statistic.name) for statistic in result.statistics):
         points = points_word(result.methods)
         yield f"Distances and lengths are in {unit}, variances in {unit}², summed over all {points} of a shape."
-    counts = [len(one.arrangements) for one in result.statistics if len(one.arrangements)]
+    counts = [len(statistic.arrangements) for statistic in result.statistics if len(statistic.arrangements)]
     if counts:
         yield f"{len(result.cohort)} shapes, {max(counts)} permutations, the observed data among them."
 
 
-def _sentence(one: Statistic, level: float) -> str:
-    figures = [f"{one.name} {one.value:.4g}"]
-    if one.low is not None and one.high is not None:
-        figures.append(f"interval {one.low:.4g} to {one.high:.4g}")
-    if one.z is not None:
-        figures.append(f"Z {one.z:.2f}")
-    if one.p is not None:
-        figures.append(f"p {one.p:.3g}")
-        figures.append("significant" if one.p <= level else "not significant")
-        if len(one.arrangements) and (least := _least_p(one.arrangements)) > level:
+def _sentence(statistic: Statistic, level: float) -> str:
+    figures = [f"{statistic.name} {statistic.value:.4g}"]
+    if statistic.low is not None and statistic.high is not None:
+        figures.append(f"interval {statistic.low:.4g} to {statistic.high:.4g}")
+    if statistic.z is not None:
+        figures.append(f"Z {statistic.z:.2f}")
+    if statistic.p is not None:
+        figures.append(f"p {statistic.p:.3g}")
+        figures.append("significant" if statistic.p <= level else "not significant")
+        if len(statistic.arrangements) and (least := _least_p(statistic.arrangements)) > level:
             figures.append(f"no p below {least:.2g} is possible with so few arrangements that differ")
-    if one.unknown_p == "short vectors":
+    if statistic.unknown_p == "short vectors":
         figures.append("p not known: neither vector is longer than its noise, so that no direction is determined")
-    if one.unknown_p == "raw residuals":
+    if statistic.unknown_p == "raw residuals":
         figures.append(
-            f"p not known: {permutation_p(one.arrangements):.3g} by raw residuals, as in RRPP, is too small if "
+            f"p not known: {permutation_p(statistic.arrangements):.3g} by raw residuals, as in RRPP, is too small if "
             "the common change is short; omit --residuals raw"
         )
     text = ", ".join(figures)
-    return f"{one.tested}: {text}" if one.tested else f"{text[:1].upper()}{text[1:]}"
+    return f"{statistic.tested}: {text}" if statistic.tested else f"{text[:1].upper()}{text[1:]}"
 
 
 def _least_p(arrangements: FloatArray) -> float:
@@ -108,14 +108,14 @@ def _least_p(arrangements: FloatArray) -> float:
 
 def _statistics_table(result: ShapeTestResult) -> ResultTable:
     note = f"{result.test.statistics[:1].upper()}{result.test.statistics[1:]}."
-    unknown = dict.fromkeys(one.name for one in result.statistics if one.unknown_p)
+    unknown = dict.fromkeys(statistic.name for statistic in result.statistics if statistic.unknown_p)
     note += f" p of {', '.join(unknown)} is not known where it is blank." if unknown else ""
     return ResultTable(
         title="Statistics",
         columns=(
             Column("statistic", field="statistic"), Column("tested", field="tested"),
             Column("value", "number", "value"), Column("Z", "number", "z"), Column("p", "p", "p"),
-            *(Column(field=one) for one in ("low", "high", "p_not_known")),
+            *(Column(field=name) for name in ("low", "high", "p_not_known")),
         ),
         rows=[
             (s.name, s.tested, s.value, s.z, s.p, s.low, s.high, s.unknown_p or "") for s in result.statistics
@@ -127,10 +127,11 @@ def _statistics_table(result: ShapeTestResult) -> ResultTable:
 
 
 def _histograms(result: ShapeTestResult) -> Iterator[HistogramPart]:
-    for one in [each for each in result.statistics if len(each.arrangements) > 1][:_MOST_HISTOGRAMS]:
+    for statistic in [each for each in result.statistics if len(each.arrangements) > 1][:_MOST_HISTOGRAMS]:
         yield histogram_part(
-            f"{one.label} among its permutations", {"permutations": one.arrangements[np.isfinite(one.arrangements)]},
-            _BINS, x=one.name, observed=one.value, observed_label="observed",
+            f"{statistic.label} among its permutations",
+            {"permutations": statistic.arrangements[np.isfinite(statistic.arrangements)]},
+            _BINS, x=statistic.name, observed=statistic.value, observed_label="observed",
         )  # fmt: skip
 
 

@@ -63,7 +63,7 @@ def score_report(result: ScoreResult) -> AnalysisReport:
 
 
 def _sentence(result: ScoreResult, k: int) -> str:
-    near = ", ".join(one.name for one in result.nearest[k])
+    near = ", ".join(neighbour.name for neighbour in result.nearest[k])
     small = " (a small reference)" if result.people < SMALL else ""
     sentence = (
         f"{result.names[k]} lies {result.distance[k]:.1f} standard deviations from the reference's mean in "
@@ -82,7 +82,7 @@ def _sentence(result: ScoreResult, k: int) -> str:
 
 def _method_sentences(result: ScoreResult) -> tuple[str, ...]:
     limit = (
-        f"Of 95 % of the reference's subjects no vertex lies beyond {result.z_limit:.1f} standard deviations."
+        f"In 95 % of the reference's subjects no vertex lies beyond {result.z_limit:.1f} standard deviations."
         if math.isfinite(result.z_limit)
         else "With fewer than 19 subjects in the reference, the limit of |z| for single vertices cannot be estimated."
     )
@@ -90,7 +90,7 @@ def _method_sentences(result: ScoreResult) -> tuple[str, ...]:
     return (
         f"Distances are Mahalanobis distances in {counted(result.modes, 'mode')} of the reference with "
         f"{100 * result.variance_share:.0f} % of its variance, by its covariance{unsure}.",
-        "Percentiles are found by leaving out the reference's subjects in turn, and hold whatever the distribution; p "
+        "Percentiles are leave-one-out percentiles of the reference's subjects, valid for any distribution; p "
         "is by the F distribution of normal shapes, which is too large where the reference is small.",
         limit,
     )
@@ -112,7 +112,7 @@ def _score_table(result: ScoreResult) -> ResultTable:
             name, result.distance[k], 1 - result.farther[k], result.percentile[k], result.farther[k],
             result.p_value[k], result.rest_mm[k], 1 - result.rest_farther[k], result.rest_farther[k],
             result.beyond_mm[k], result.beyond_farther[k], result.beyond_2[k], result.size_mm[k], result.size_z[k],
-            ", ".join(one.name for one in result.nearest[k]), "; ".join(result.outside[k]), f"z_{k + 1}",
+            ", ".join(neighbour.name for neighbour in result.nearest[k]), "; ".join(result.outside[k]), f"z_{k + 1}",
         )
         for k, name in enumerate(result.names)
     ]  # fmt: skip
@@ -131,9 +131,9 @@ def _file_tables(result: ScoreResult) -> tuple[ResultTable, ResultTable]:
     """Return the tables of the nearest subjects and of the reference, which are files alone."""
     field = LengthFormat(result.subjects.unit).field
     near = [
-        (name, rank, one.name, one.distance, one.rms_mm)
+        (name, rank, neighbour.name, neighbour.distance, neighbour.rms_mm)
         for name, references in zip(result.names, result.nearest, strict=True)
-        for rank, one in enumerate(references, 1)
+        for rank, neighbour in enumerate(references, 1)
     ]
     reference = zip(result.reference_names, result.reference_distance, result.reference_rest_mm, strict=True)
     return (
@@ -144,20 +144,20 @@ def _file_tables(result: ScoreResult) -> tuple[ResultTable, ResultTable]:
 
 def _histogram(result: ScoreResult) -> HistogramPart:
     every = np.concatenate([result.reference_distance, result.distance])
-    one = len(result.names) == 1
+    is_single = len(result.names) == 1
     values = {"reference, each by the others": result.reference_distance}
     return histogram_part(
-        "Distances", values if one else {**values, "subjects": result.distance},
+        "Distances", values if is_single else {**values, "subjects": result.distance},
         np.linspace(0.0, float(every.max()) * 1.02, _BINS + 1), x="Mahalanobis distance (SD)",
-        observed=float(result.distance[0]) if one else None, observed_label=result.names[0] if one else "",
+        observed=float(result.distance[0]) if is_single else None, observed_label=result.names[0] if is_single else "",
     )  # fmt: skip
 
 
 def _maps(result: ScoreResult, order: list[int]) -> Iterator[Part]:
     rest = len(order) - _MOST_MAPS
     text = (
-        "How far each vertex lies from the reference's mean along its normal, in standard deviations of the reference"
-        f"{'' if result.subjects.fitted is None else ' and what the fit is unsure of'}."
+        "Distance of each vertex from the reference's mean along its normal, in standard deviations of the reference"
+        f"{'' if result.subjects.fitted is None else ' and the uncertainty of the fit'}."
         f"{f' Maps of {rest} more are in {_FILE}.' if rest > 0 else ''}"
     )
     yield TextPart(title="Maps", level=2, text=text)

@@ -1,4 +1,4 @@
-"""What every page is made of: text, tables, figures, and sections that hold them; templates turn them to HTML."""
+"""Building blocks of a page: text, tables, figures, and sections of blocks; templates turn them into HTML."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from shapespace.report.blocks.wording import DASH, STATUS_WORDS, counted, isfini
 class Text:
     """A paragraph, or a sentence of a list, perhaps after a name; its kind is a class of report.css.
 
-    Nothing is shown of an empty text, and of notes, a notice and a folded part without content.
+    Empty text is not shown, nor are notes, notices and folded parts without content.
     """
 
     text: str
     kind: Literal["", "soft", "notice", "broken"] = ""
     name: Cell | None = None
-    """Before the text: a status, or what may lead to a place in the page."""
+    """Cell before the text: a status, or a link to a place in the page."""
 
 
 @dataclass(frozen=True)
@@ -35,10 +35,10 @@ class Cell:
     """One cell of a table, or a few words in a sentence.
 
     Args:
-        text: what is read.
+        text: text of the cell.
         value: the number that a table sorts it by; None sorts by the text, not-a-number comes last.
-        status: which of the statuses it is, for its colour; empty for none.
-        anchor: where in the page it leads, or None.
+        status: name of the status, which sets the colour; empty for none.
+        anchor: place in the page that the cell links to, or None.
     """
 
     text: str
@@ -48,13 +48,13 @@ class Cell:
 
     @property
     def sort_key(self) -> float | str:
-        """The value, empty where it is not a number."""
+        """The value; empty if it is not a number."""
         return self.value if self.value is not None and isfinite(self.value) else ""
 
 
 @dataclass(frozen=True)
 class Column:
-    """One column of a table: its head, and whether it holds numbers or text."""
+    """One column of a table: its head, and whether it contains numbers or text."""
 
     head: str
     kind: Literal["text", "number"] = "text"
@@ -66,10 +66,10 @@ class Table:
 
     Args:
         columns: heads and kinds.
-        rows: one cell a column.
-        caption: what the table holds, also the name of its scroll box.
-        sortable: the page's script makes buttons of the heads.
-        stack: on a phone the cells of a row stand under each other, for tables of long text.
+        rows: cells, one per column.
+        caption: content of the table, also the name of its scroll box.
+        sortable: whether the page's script turns the heads into buttons that sort.
+        stack: whether the cells of a row are stacked on a phone, for tables of long text.
     """
 
     MOST_OPEN = 14
@@ -83,7 +83,7 @@ class Table:
 
     @property
     def long(self) -> bool:
-        """Whether it scrolls within itself, under its heads."""
+        """Whether the table scrolls within itself, under its heads."""
         return len(self.rows) > self.MOST_OPEN
 
 
@@ -97,14 +97,14 @@ class Facts:
 
 @dataclass(frozen=True)
 class Tiles:
-    """Figures that are seen at a glance, each (value, small print after it, what it is)."""
+    """Key figures, each (value, small print after it, name)."""
 
     rows: Sequence[tuple[str, str, str]]
 
 
 @dataclass(frozen=True)
 class Notice:
-    """A box with a list of sentences; nothing where there are none."""
+    """A box with a list of sentences; not shown if the list is empty."""
 
     heading: str
     items: Sequence[str | Text]
@@ -120,7 +120,7 @@ class Notes:
 
 @dataclass(frozen=True)
 class Image:
-    """WebP `data` of `size` pixels; `alt` says what is seen."""
+    """WebP `data` of `size` pixels; `alt` describes the picture."""
 
     data: bytes
     size: tuple[int, int]
@@ -128,7 +128,7 @@ class Image:
 
     @property
     def source(self) -> str:
-        """The picture as it stands in a page."""
+        """The picture as a data URL for a page."""
         return "data:image/webp;base64," + base64.b64encode(self.data).decode("ascii")
 
 
@@ -143,15 +143,15 @@ class Figure:
 
 @dataclass(frozen=True)
 class Turning:
-    """What turns where the browser can, and is a still on paper and without a script.
+    """A widget that turns in a browser with scripts, and is a still picture on paper and without scripts.
 
     Args:
         widget: a name of `Shapespace.widgets`, which the scripts `widget-*.js` define.
-        payload: the id of what it shows.
-        poster: the still.
-        caption: of both.
-        label: what it is, for screen readers.
-        still: what the still shows, printed with it alone.
+        payload: id of the data that the widget shows.
+        poster: still picture.
+        caption: caption of the widget and of the still picture.
+        label: description for screen readers.
+        still: description of the still picture, printed with it only.
     """
 
     widget: Literal["modes", "morph", "fit", "scatter", "morphospace"]
@@ -167,14 +167,14 @@ class Card:
     """One fit in a gallery.
 
     Args:
-        anchor: its name in the page.
-        name: of the fit.
-        status: of the fit.
-        label: beside it; empty for none.
-        text: in a sentence or two.
-        image: its picture, or None.
-        why_none: why there is no picture.
-        detail: the place with all its pictures, or None.
+        anchor: anchor of the card in the page.
+        name: name of the fit.
+        status: status of the fit.
+        label: label next to the name; empty for none.
+        text: summary in one or two sentences.
+        image: picture of the fit, or None.
+        why_none: reason why there is no picture.
+        detail: place with all pictures of the fit, or None.
     """
 
     anchor: str
@@ -189,14 +189,14 @@ class Card:
 
 @dataclass(frozen=True)
 class Gallery:
-    """Cards beside each other."""
+    """Cards next to each other."""
 
     cards: Sequence[Card]
 
 
 @dataclass(frozen=True)
 class StripKey:
-    """The key of strips in a gallery: what their panels show in words, and scales, each (bar, its ends in words)."""
+    """The key of strips in a gallery: the content of the panels in words, and scales, each (bar, ends in words)."""
 
     text: str
     bars: Sequence[tuple[Image, str, str]]
@@ -205,7 +205,7 @@ class StripKey:
 
 @dataclass(frozen=True)
 class Folded:
-    """A part that is folded away until it is asked for."""
+    """A part that is folded until the reader opens it."""
 
     summary: str
     body: Sequence[Block]
@@ -228,10 +228,10 @@ class Section:
     body: Sequence[Block]
     level: int = 3
     link: str = ""
-    """What the navigation calls it."""
+    """Name of the section in the navigation."""
     folded: bool = False
     status: Cell | None = None
-    """Beside the heading."""
+    """Status next to the heading."""
 
 
 Block: TypeAlias = (
@@ -264,18 +264,18 @@ def status(value: str) -> Cell:
 def first_items(
     items: Sequence[_Item], most: int, where: str, word: str = "other", words: str | None = None
 ) -> list[_Item | str]:
-    """Return the first items of a list, and a sentence that counts the others and says where they are."""
+    """Return the first items of a list, and a sentence with the number and the place of the others."""
     return [*items[:most], *([f"{counted(len(items) - most, word, words)}, {where}."] if len(items) > most else [])]
 
 
 def no_picture(count: int, noun: str) -> Text:
-    """Return a sentence on those of which a gallery has no card."""
+    """Return a sentence on the number of results without a card in a gallery."""
     others = f"{counted(count, f'other {noun}')} have no picture here"
     return Text(f"{others}, so that this file stays below 8 MB; the table has them all." if count else "")
 
 
 def number(value: float, digits: int = 2) -> Cell:
-    """Return a cell that shows `value` with `digits` decimals, a dash where there is none."""
+    """Return a cell that shows `value` with `digits` decimals, a dash if it is not finite."""
     return Cell(f"{value:.{digits}f}" if isfinite(value) else DASH, value)
 
 
@@ -285,7 +285,7 @@ def length(value: float) -> Cell:
 
 
 def table_of(items: Sequence[_Item], columns: Sequence[tuple[Column, Callable[[_Item], Cell]]], caption: str) -> Table:
-    """Return a table that sorts, with a row for each item and cells that the columns make of it."""
+    """Return a sortable table with one row per item, whose cells the columns make."""
     rows = [[make(item) for _, make in columns] for item in items]
     return Table([column for column, _ in columns], rows, caption, sortable=len(rows) > 1)
 

@@ -57,22 +57,22 @@ from shapespace.schemas import Quality, VertexErrors
 from shapespace.types import FloatArray, Mesh
 
 MODEL_PICTURES, FIT_PICTURES = 4, 9
-"""How many pictures `model_part` and `fit_in_full` make."""
+"""Number of pictures that `model_part` and `fit_in_full` make."""
 
-MODES_IN_WIDGET = 8  # sliders that fit beside the picture; their displacements are most of the payload
+MODES_IN_WIDGET = 8  # sliders that fit next to the picture; their displacements are most of the payload
 SCAN_TRIANGLES = 8_000
-"""How many triangles of a scan turn in the page; the file of the scan has them all."""
+"""Triangles of a scan in the page; the file of the scan has all."""
 
 _From = TypeVar("_From")
 _To = TypeVar("_To")
 _CAPTION_HEIGHT = 0.14
-"""Of a figure, beside its width."""
+"""Height of the caption of a figure, as a share of the figure's width."""
 _DETAIL_BYTES = 1_300_000  # bytes of the page that all pictures of one fit take
 _VARIANCE_SHARES = (0.90, 0.95, 0.98, 0.99)  # shares of the variance that are usual in publications
 
 
 def concern(fit: SavedFit) -> tuple[int, float]:
-    """Return a key that sorts fits by how much they need a look: by status, then by the error expected or seen."""
+    """Return a key that sorts fits by their need for review: by status, then by the expected or measured error."""
     error = fit.expected_error_mm
     if not isfinite(error):
         error = fit.distance_mm("scan_to_model")
@@ -91,7 +91,7 @@ def in_columns(*pictures: Block) -> Block:
 
 
 def _height(block: Block) -> float:
-    """Return about how high a block is beside its width."""
+    """Return the approximate height of a block as a share of its width."""
     return block.image.size[1] / block.image.size[0] + _CAPTION_HEIGHT if isinstance(block, Figure) else _CAPTION_HEIGHT
 
 
@@ -99,13 +99,13 @@ def _height(block: Block) -> float:
 
 
 def model_part(page: Page, model: ShapeModel, *, figure_of: str = "", to_move: int = MODES_IN_WIDGET) -> list[Block]:
-    """Return what the model is and does: facts, modes to move by hand, modes as stills, spectrum.
+    """Return the blocks of a model: modes with sliders, facts, modes as stills, spectrum.
 
     Args:
-        page: that it goes to.
+        page: page that receives the blocks and their data.
         model: the shape space.
-        figure_of: said before the caption of the modes.
-        to_move: how many modes can be moved by hand.
+        figure_of: text before the caption of the modes.
+        to_move: number of modes with a slider.
     """
     needed = [
         f"{100 * share:g} % in {counted(count, 'mode')}"
@@ -138,8 +138,8 @@ def model_part(page: Page, model: ShapeModel, *, figure_of: str = "", to_move: i
                     ),
                     page.figure(
                         figures.spectrum_figure(model),
-                        "Share of the training set's variance that the first modes hold.",
-                        alt=f"Spectrum: {listed(needed) or 'the modes kept hold less than 90 % of the variance'}",
+                        "Share of the training set's variance in the first modes.",
+                        alt=f"Spectrum: {listed(needed) or 'the modes kept contain less than 90 % of the variance'}",
                         chart=True,
                     ),
                     page.figure(
@@ -155,10 +155,10 @@ def model_part(page: Page, model: ShapeModel, *, figure_of: str = "", to_move: i
 
 
 def quality_part(page: Page, quality: Quality) -> Figure:
-    """Return how good the shape space is by its number of modes, from the measures of it that are there."""
+    """Return the quality of a shape space by its number of modes, from the measures that are present."""
     return page.figure(
         figures.quality_figure(quality),
-        "Compactness: share of the variance. Generalisation: error on shapes left out. Specificity: distance of random "
+        "Compactness: share of the variance. Generalisation: error on held-out shapes. Specificity: distance of random "
         "shapes from the nearest training shape. Bands: 95 % intervals where they were measured. "
         + " ".join(quality.sentences),
         alt="Compactness, generalisation and specificity by the number of modes, those of them that were measured",
@@ -167,7 +167,7 @@ def quality_part(page: Page, quality: Quality) -> Figure:
 
 
 def modes_to_move(page: Page, model: ShapeModel, most: int) -> Turning | Figure:
-    """Return the model's modes with sliders, as stills of the mean where nothing turns."""
+    """Return the model's modes with sliders, and a still of the mean as the fallback."""
     count = min(most, model.n_modes)
     still = thumbnails.mesh_still(model.mesh(), (420, 420))
     which = f"The first {counted(count, 'mode')} of {model.n_modes}"
@@ -195,18 +195,18 @@ def fit_in_full(
     of_paper: bool = False,
     folded: bool = False,
 ) -> list[Block]:
-    """Return one fit to turn and every picture of it, as far as the file's size allows.
+    """Return the widget and all pictures of one fit, as far as the size of the file allows.
 
     Args:
-        page: that they go to.
-        fit: with its stages.
-        population: (N, K) coefficients of others in standard deviations, or None.
+        page: page that receives the blocks and their data.
+        fit: fit with its stages.
+        population: (N, K) coefficients of other fits in standard deviations, or None.
         reserve: bytes of the page that are kept free.
         of_paper: whether captions name the figures of the paper.
-        folded: whether all but what turns is folded away.
+        folded: whether all blocks but the widget are folded.
     """
     if page.left < _DETAIL_BYTES + reserve:
-        return [Text("Its pictures would make this file larger than 8 MB, so they are left out.", "soft")]
+        return [Text("Its pictures would make this file larger than 8 MB, so they are omitted.", "soft")]
     turning = page.tried(lambda: fit_to_turn(page, fit))
     pictures = fit_pictures(page, fit, population, of_paper=of_paper)
     stages, iterations = ("", "") if fit.regions is None else ("stages, ", "iterations, ")
@@ -217,7 +217,7 @@ def fit_in_full(
 
 
 def fit_to_turn(page: Page, fit: StagedFit) -> Turning | Figure:
-    """Return scan and model of one fit, as a strip of stills where nothing turns."""
+    """Return the widget of scan and model of one fit, with a strip of stills as the fallback."""
     limit_mm = fit.scale_mm
     scale = (
         f"the signed distance to the scan, −{limit_mm:g} (blue) to +{limit_mm:g} mm (red)."
@@ -238,10 +238,10 @@ def surface_to_turn(page: Page, fit: SavedFit, surfaces: Mapping[str, Mesh], why
     """Return the fitted surface of a fit whose scan cannot be shown, with a still image as the fallback.
 
     Args:
-        page: that it goes to.
-        fit: of which it is.
-        surfaces: `final`, and `dense` where there is one, in the picture frame.
-        why: the scan is not shown, as the end of a sentence.
+        page: page that receives the surface.
+        fit: fit of the surface.
+        surfaces: `final`, and if the fit has one, `dense`, in the picture frame.
+        why: reason why the scan is not shown, as the end of a sentence.
     """
     return page.turning(
         "fit",
@@ -254,21 +254,21 @@ def surface_to_turn(page: Page, fit: SavedFit, surfaces: Mapping[str, Mesh], why
 
 
 def strip_alt(fit: StagedFit, limit_mm: float) -> str:
-    """Return what is seen in `stills.fit_strip`, in words."""
+    """Return the alternative text of `thumbnails.fit_strip`."""
     return (
         f"{fit.label}: the scan, scan and model over each other, and a map of the distances; "
-        f"{share_within(fit, limit_mm)} of what the scan shows lies within {limit_mm:g} mm"
+        f"{share_within(fit, limit_mm)} of the vertices that the scan shows lie within {limit_mm:g} mm"
     )
 
 
 def share_within(fit: StagedFit, limit_mm: float) -> str:
-    """Return the share of the vertices that the scan shows which lie within `limit_mm` of it."""
+    """Return the share of the observed vertices that lie within `limit_mm` of the scan."""
     known = measured_mm(fit.model_to_scan_mm["final"])
     return percent(float((known <= limit_mm).mean())) if len(known) else "none"
 
 
 def fit_pictures(page: Page, fit: StagedFit, population: FloatArray | None, *, of_paper: bool) -> Block:
-    """Return every picture of one fit, as `fit_in_full` has them."""
+    """Return all pictures of one fit for `fit_in_full`."""
     stages = {"before": "before", "initial": "after phase 1", "final": "after phase 2", "dense": "dense"}
     largest = "largest distance from model to scan " + listed(
         [
@@ -316,12 +316,12 @@ _CAPTIONS = {
     "coincide.",
     "signed_maps": "Signed distances both ways, positive where the scan lies outside of the model; those of a scan of "
     "points only have no sign. Scan points beyond the model's rim are not counted.",
-    "regions_figure": "What the fit made of each part of the model: it followed the scan, rejected what the scan shows "
-    "there, lay at the scan's border, or was not seen.",
+    "regions_figure": "Parts of the model that followed the scan, that were rejected because the scan shows something "
+    "else there, that lay at the scan's border, or that the scan does not show.",
     "threshold_figure": "Where the model lies within 2 to 10 mm of the scan. Above each panel: share of the vertices "
     "that the scan shows.",
     "distance_histograms": "Closest distances both ways, by stage. Scan points beyond the model's rim are not counted.",
-    "history_figure": "RMS of the closest distances that the fit itself sees, by phase.",
+    "history_figure": "RMS of the closest distances in the fit, by phase.",
     "coefficients_figure": "Coefficients in standard deviations of the training set, with their own uncertainty. "
     "Beyond about 3 they are rare in it.",
 }
@@ -349,7 +349,7 @@ def fit_facts(fit: SavedFit) -> list[Block]:
 
 
 def distances_text(fit: SavedFit) -> str:
-    """Return the mean distances of one fit both ways, what they are over, and the shares seen."""
+    """Return the mean distances of one fit both ways, and the observed shares that they are averaged over."""
     to_scan, to_model = mm(fit.distance_mm("model_to_scan")), mm(fit.distance_mm("scan_to_model"))
     overlap = fit.record.shown
     seen, covered = (overlap.model_seen_share, overlap.scan_covered_share) if overlap else (None, None)
@@ -367,7 +367,7 @@ def _over(share: float | None, of: str) -> str:
 
 
 def usable(items: Sequence[_From], load: Callable[[_From], _To]) -> tuple[list[_To], list[str]]:
-    """Return what `load` gives, and one sentence for each of the items that it refuses."""
+    """Return the results of `load`, and a sentence for each item that it rejects."""
     usable_fits: list[_To] = []
     problems: list[str] = []
     for item in items:
@@ -411,10 +411,10 @@ def lines_through_neutral(
     """Return the line structure of one subject's expressions in two and in three coefficients (figures 9 and 10).
 
     Args:
-        page: that it goes to.
+        page: page that receives the figures.
         points: the expressive fits, with at least two coefficients.
         neutral: the fit of the neutral face, through which the lines pass; None draws none.
-        figures_of: said before the two captions.
+        figures_of: texts before the two captions.
     """
     about = (
         "Larger marks are stronger expressions. Lines pass through the fitted neutral face and fit best in all "
@@ -443,7 +443,7 @@ def lines_through_neutral(
 
 
 def scatter_to_turn(page: Page, points: Sequence[figures.Coefficients]) -> Turning | Figure:
-    """Return b1, b2 and b3 in space, as a still where nothing turns."""
+    """Return the widget of b1, b2 and b3 in space, with a still as the fallback."""
     still = figures.encode_webp(figures.b_space(points), lossless=True)
     first = np.stack([point.b[:MODES_IN_WIDGET] for point in points])
     return page.turning(
@@ -502,14 +502,14 @@ EVIDENCE: Mapping[str, _Entry] = MappingProxyType(
         "layers_apart_mm": ("... distance of these layers", mm),
         "displaced_share": ("Share of the scan that runs along the surface at a distance from it", percent),
         "displaced_inward_share": ("... inside the surface", percent),
-        "displaced_bound": ("... largest of left-out training shapes", percent),
+        "displaced_bound": ("... largest of held-out training shapes", percent),
         "displaced_moved_mm": ("... robust residual SD after a similarity moved it onto the surface", mm),
         "displaced_purity": ("... of the unexplained parts of the scan", percent),
         "scattered_share": ("Share of the scan that scatters widely around the surface", percent),
         "second_instance_mm": ("Distance of a second instance in the scan", mm),
         "second_instance_gap_mm": ("... gap between the two (negative: they overlap)", mm),
         "mirrored_log_odds": ("Log odds that the scan is mirrored (nats; above 5: mirrored, below -5: not)", _plain),
-        "mirrored_bound": ("... largest of left-out training shapes (mirrored only above it)", _plain),
+        "mirrored_bound": ("... largest of held-out training shapes (mirrored only above it)", _plain),
         "mirrored_apart_mm": ("... vertex error if it is mirrored (mean)", mm),
         "training_shapes": ("Number of training shapes of the model", _plain),
         "marks_stddev_mm": ("Standard deviation of the landmarks given", mm),
@@ -534,9 +534,9 @@ def fits_table(fits: Sequence[SavedFit], places: Mapping[str, str], *, caption: 
     """Return a table of all fits that sorts, without the columns that would be empty.
 
     Args:
-        fits: in the order wanted.
-        places: where in the page a fit is shown, by its name.
-        caption: of the table.
+        fits: fits in the order of the rows.
+        places: anchors in the page by the names of the fits.
+        caption: caption of the table.
     """
     columns: list[tuple[Column, _Make]] = [
         (Column("Scan"), lambda fit: Cell(fit.name, anchor=places.get(fit.name))),
@@ -592,7 +592,7 @@ _NUMBERS: list[tuple[str, _Make]] = [
 
 SCORE_WORDS: Mapping[str, str] = {
     "line_r2_through_neutral": "Share of the deviation on the line through neutral (R²)",
-    "line_r2_free": "R² of the best line anywhere, of the scatter about the mean (a smaller whole, so it may be lower)",
+    "line_r2_free": "R² of the best line anywhere, relative to the scatter about the mean (so it may be lower)",
     "line_sign_consistency": "Share of faces on the same side of neutral",
     "line_spearman": "Rank correlation of position on the line with intensity",
     "line_permutation_p": "Its permutation p-value",
@@ -603,17 +603,17 @@ SCORE_WORDS: Mapping[str, str] = {
     "separability": "Between-class over within-class scatter",
     "accuracy_p": "Permutation p-value of the accuracy",
     "silhouette_p": "Permutation p-value of the silhouette",
-    "left_out": "Faces left out because their fit is not trusted",
+    "left_out": "Faces excluded because their fit is not trusted",
 }
 
 
 def score_tables(scores: Mapping[str, Any], *, many: str, single: str) -> list[Block]:
-    """Return scores as tables: those given for each of several things as one, single values as another.
+    """Return scores as tables: one of the scores of several classes, one of single values.
 
     Args:
-        scores: name -> value, or name -> {thing: value}.
-        many: caption of the first.
-        single: caption of the second.
+        scores: name -> value, or name -> {class: value}.
+        many: caption of the first table.
+        single: caption of the second table.
     """
 
     def row(key: str, values: Sequence[object]) -> list[Cell]:
@@ -659,15 +659,15 @@ _LEVEL_HEADS = (
 
 
 def settings_blocks(configs: Sequence[Mapping[str, Any]], first: Sequence[tuple[str, str]]) -> list[Block]:
-    """Return what fits ran with: choices as sentences, and the numbers of the method folded away.
+    """Return the settings of fits: choices as sentences, and the numbers of the method, folded.
 
     Args:
         configs: settings of each fit, from its record; they may be damaged.
-        first: names and values that stand before them.
+        first: names and values of the first rows.
     """
     rows = list(first)
-    for name, tell in _CHOICES:
-        texts = list(dict.fromkeys(tell(config) for config in configs))
+    for name, format_choice in _CHOICES:
+        texts = list(dict.fromkeys(format_choice(config) for config in configs))
         if any(texts):
             rows.append((name, "; of others: ".join(texts[:4])))
     out: list[Block] = [Facts(rows, _CAPTION)]
@@ -687,7 +687,7 @@ def settings_blocks(configs: Sequence[Mapping[str, Any]], first: Sequence[tuple[
 
 
 def described(cls: type) -> dict[str, str]:
-    """Return what each argument of a class is, from its docstring."""
+    """Return the description of each argument of a class, from its docstring."""
     entries = re.findall(
         r"^    (\w+): (.*(?:\n        .*)*)",
         (inspect.getdoc(cls) or "").partition("Args:\n")[2].partition("\n\n")[0],
@@ -709,7 +709,7 @@ def _numbers(key: str, values: Mapping[str, Any], part_name: str) -> list[Block]
     for name, value in _flat(key, values):
         owner, _, own = name.rpartition(".")
         cells.append([words(own), plain(value), (described(_OF[owner]).get(own, "") if owner in _OF else "") or DASH])
-    return [*out, text_table(("Setting", "Value", "What it is"), cells, f"Settings of {part_name}")]
+    return [*out, text_table(("Setting", "Value", "Meaning"), cells, f"Settings of {part_name}")]
 
 
 def _level(name: str, value: object) -> str:
@@ -755,8 +755,8 @@ def _scale(config: Mapping[str, Any]) -> str:
     return f"{text}, as the model is made" if config.get("scale") == "auto" else text
 
 
-_METHODS = {"robust": "robust: what does not match the model is left out", "paper": "the paper's"}
-_DENSE = {True: "made: the surface goes the rest of the way to the scan"}
+_METHODS = {"robust": "robust: parts of the scan that do not match the model are excluded", "paper": "the paper's"}
+_DENSE = {True: "made: the surface was moved onto the scan"}
 _CHOICES: tuple[tuple[str, Callable[[Mapping[str, Any]], str]], ...] = (
     ("Method", lambda config: _METHODS.get(str(config.get("method")), plain(config.get("method")))),
     ("Modes", _modes),

@@ -19,9 +19,9 @@ STATUS_WORDS: Mapping[str, str] = {
     "failed": "failed",
     "unreadable": "unreadable",
 }
-"""What each status is called, the best first."""
+"""Statuses in words, from the best to the worst."""
 ORDER_OF_CONCERN = ("failed", "unreadable", "doubtful", "max_iterations", "converged")
-"""Statuses, those first that somebody must look at."""
+"""Statuses, those that need review first."""
 
 DASH = "–"
 _FOLDERS = re.compile(r"""(?<![\w.~/\\])(?:[A-Za-z]:)?[\\/](?:[^\s'",;:()\\/]+[\\/])*(?=[^\s\\/])""")
@@ -70,7 +70,7 @@ def mm(value: float) -> str:
 
 
 def percent(share: float) -> str:
-    """Return a percentage that says 100 only when it is all, and 0 only when it is none."""
+    """Return a percentage that is 100 only for a share of 1, and 0 only for a share of 0."""
     if not isfinite(share):
         return DASH
     if 0.0 < share < 0.01:

@@ -70,10 +70,10 @@ def views_of(mesh: Mesh) -> list[tuple[str, FloatArray, float]]:
     """Return the views of a mesh, those of the orientation first of all: name, rotation (3, 3), and yaw after it.
 
     Raises:
-        InputError: as of `upright_views`.
+        InputError: see `upright_views`.
     """
     turn, sides = upright_views(mesh)
-    return [(one.name, view_rotation(one), 0.0) for one in current_orientation().views] or [
+    return [(named_view.name, view_rotation(named_view), 0.0) for named_view in current_orientation().views] or [
         (name, turn, yaw) for name, yaw in sides
     ]
 
@@ -81,12 +81,12 @@ def views_of(mesh: Mesh) -> list[tuple[str, FloatArray, float]]:
 def upright_views(mesh: Mesh) -> tuple[FloatArray, Sequence[tuple[str, float]]]:
     """Return the rotation (3, 3) that brings `mesh` upright, and names of views with their yaw, degrees.
 
-    The first view of the orientation is upright. Without one, the mesh stays as it stands where that is upright with
+    The first view of the orientation is upright. Without an orientation, the mesh is not turned if it is upright with
     its front along +z, as faces are; otherwise its principal axes turn it. A surface that is open to one side is seen
-    from the other alone.
+    only from the opposite side.
 
     Raises:
-        InputError: it has no extent, or one beyond all measure.
+        InputError: the mesh has no extent, or extends beyond 10 km.
     """
     vertices = mesh.vertices
     if not np.abs(vertices).max(initial=0.0) < _FARTHEST_MM or not np.ptp(vertices, axis=0).max(initial=0.0) > 0:
@@ -116,16 +116,16 @@ def surface_map_figure(
     """Draw a number for each vertex on a surface, seen from several sides.
 
     Args:
-        mesh: in mm; without faces its vertices are drawn as balls.
-        values: (V,); not-a-number is drawn in grey.
-        unit: of the numbers.
-        signed: whether two colours part at zero.
-        limit: where the colours end; None for what 98 % of the numbers stay below.
-        mask: (V,) outside which the colour is pale; None for none.
-        title: above the figure; None for none, as in a page that has a heading.
+        mesh: mesh in mm; vertices of a mesh without faces are drawn as balls.
+        values: (V,) numbers; NaN is drawn in grey.
+        unit: unit of the numbers.
+        signed: whether the colour scale diverges at zero.
+        limit: end of the colour scale; None for the 98 % quantile of the magnitudes, rounded up.
+        mask: (V,) vertices in full colour, the others are pale; None for no mask.
+        title: text above the figure; None for no title, as in a page that has a heading.
 
     Raises:
-        InputError: another number of values or of the mask's, no finite value, a limit that is none, or no extent.
+        InputError: values or mask of another length, no finite value, a limit that is not positive, or no extent.
     """
     count = len(mesh.vertices)
     if values.shape != (count,) or (mask is not None and mask.shape != (count,)):
@@ -151,13 +151,13 @@ def surface_map_figure(
         if mask is not None and not mask.all():
             pale = render(replace(full, colormap=_PALE + (1 - _PALE) * colours), camera=camera, size=size)
             image = np.rint(
-                pale + (image.astype(float) - pale) * _inside(turned_mesh, mask, camera, size)[:, :, None]
+                pale + (image.astype(float) - pale) * _mask_share(turned_mesh, mask, camera, size)[:, :, None]
             ).astype(np.uint8)
         panels.append(image)
     extend = {(True, True): "both", (True, False): "low", (False, True): "high"}.get(
         (bool(values[known].min() < low), bool(values[known].max() > end)), "neither"
     )
-    pale_note = "Pale: outside of what is marked." if mask is not None and not mask.all() else ""
+    pale_note = "Pale: outside the marked part." if mask is not None and not mask.all() else ""
     return grid(
         in_rows(panels, [name for name, _, _ in sides], _MOST_COLUMNS),
         title=None if title is None else title or f"{plain(unit)} on the surface",
@@ -166,7 +166,7 @@ def surface_map_figure(
     )
 
 
-def _inside(mesh: Mesh, mask: BoolArray, camera: Camera, size: tuple[int, int]) -> FloatArray:
+def _mask_share(mesh: Mesh, mask: BoolArray, camera: Camera, size: tuple[int, int]) -> FloatArray:
     """Return the share (H, W) of each pixel that shows triangles, or points, whose vertices are mostly in the mask."""
     width, height = size
     if mesh.faces is None:
@@ -184,13 +184,13 @@ def morph_figure(low: Mesh, high: Mesh, labels: tuple[str, str], *, title: str |
     """Draw two shapes in correspondence side by side, from one camera.
 
     Args:
-        low: one shape.
-        high: the other.
-        labels: what they are.
-        title: above the figure; None for none, as in a page that has a heading.
+        low: first shape.
+        high: second shape.
+        labels: names of the two shapes.
+        title: text above the figure; None for no title, as in a page that has a heading.
 
     Raises:
-        InputError: no extent, or one beyond all measure.
+        InputError: no extent, or one beyond 10 km.
     """
     turn, yaws = upright_views(low)
     # Half from the side, where a change of depth is seen too.
@@ -223,12 +223,12 @@ def histogram_figure(
     """Draw a histogram, with a line at one value.
 
     Args:
-        edges: (n + 1,) rising.
-        series: for each its name, empty for none, and its (n,) counts.
-        x: what the values are, with their unit.
-        y: what the counts are, such as `share` where they are divided by their sum.
-        observed: where a line stands, such as a statistic among its permutations.
-        observed_label: what it is.
+        edges: (n + 1,) ascending edges of the bins.
+        series: name (empty for none) and (n,) counts of each histogram.
+        x: name and unit of the values.
+        y: name of the counts, such as `share` if they are divided by their sum.
+        observed: position of a line, such as a statistic among its permutations; None for no line.
+        observed_label: label of the line.
         title: above the figure.
 
     Raises:
@@ -250,7 +250,7 @@ def histogram_figure(
     low, high = float(bin_edges[0]), float(bin_edges[-1])
     if observed is not None:
         if not np.isfinite(observed):
-            raise InputError("What was observed among the values of a histogram must be a finite number.")
+            raise InputError("The observed value of a histogram must be a finite number.")
         axes.axvline(observed, color=INK, lw=2.0, ls=(0, (4, 2)), label=escaped(short(observed_label, 40)) or None)
         low, high = min(low, observed), max(high, observed)
     room = 0.02 * (high - low)
@@ -280,8 +280,8 @@ def checkerboard_figure(
     Args:
         mean: the mean shape, upright.
         surfaces: (V, 3) each, moved onto the mean shape; not-a-number where missing.
-        labels: one a surface.
-        yaw_deg: from where.
+        labels: one label per surface.
+        yaw_deg: angle of the camera from the front, degrees.
         title: above the figure.
 
     Raises:
@@ -350,7 +350,7 @@ def position_std_figure(mean: Mesh, position_std: FloatArray, limit: float, *, t
         mean,
         100 * position_std,
         Scale("standard deviation along the surface (% of the size)", SEQUENTIAL, 0.0, limit, "high"),
-        title or "How sure the position of each vertex is",
+        title or "Uncertainty of the position of each vertex",
     )
 
 
@@ -407,8 +407,8 @@ def movement_figure(
 
     Args:
         rounds: RMS of each round, shares of the size.
-        scans: the same of each scan; those that missed a round are left out.
-        settled_mm: below which the rounds end.
+        scans: RMS of each round of each scan; scans that missed a round are omitted.
+        settled_mm: movement below which the rounds end, share of the size.
         title: above the figure.
 
     Raises:
@@ -441,7 +441,7 @@ def movement_figure(
 
 
 CurveScale: TypeAlias = Literal["linear", "log", "probit"]
-"""How the numbers of a curve stand along an axis."""
+"""Scale of an axis of a curve."""
 
 _MOST_CLASSES_IN_FULL, _MOST_CLASSES = 12, 40  # classes with numbers, and without: legible at the figure's size
 _MARKERS = "os^Dvp"  # of groups, so that print without colour can be read
@@ -454,13 +454,13 @@ _SHARES = (
 
 
 def confusion_figure(counts: npt.ArrayLike, classes: Sequence[str], *, title: str = "") -> Figure:
-    """Draw a confusion matrix: a row a true class, in percent of its samples, with their number.
+    """Draw a confusion matrix: one row per true class, in percent of its samples, with their number.
 
     Right answers lie in the framed cells of the diagonal; a cell without samples stays empty.
 
     Args:
-        counts: (C, C) how many samples of the row's class were predicted to be of the column's class.
-        classes: C names.
+        counts: (C, C) number of samples of the row's class that were predicted to be of the column's class.
+        classes: names of the C classes.
         title: above the figure; by default the accuracy.
 
     Raises:
@@ -483,7 +483,7 @@ def confusion_figure(counts: npt.ArrayLike, classes: Sequence[str], *, title: st
     high = max(min(wide, 78.0), 280 / n)
     upright = longest > 0.94 * wide
     figure, axes = chart(
-        title or _confused(table, shares, classes), height=(n * high + (longest if upright else 20) + 60) / DPI
+        title or _accuracy_sentence(table, shares, classes), height=(n * high + (longest if upright else 20) + 60) / DPI
     )
     axes.imshow(shares, cmap=ListedColormap(SEQUENTIAL), vmin=0, vmax=1, aspect="auto", interpolation="nearest")
     for k in range(1, n):
@@ -507,7 +507,7 @@ def confusion_figure(counts: npt.ArrayLike, classes: Sequence[str], *, title: st
     return figure
 
 
-def _confused(table: FloatArray, shares: FloatArray, classes: Sequence[str]) -> str:
+def _accuracy_sentence(table: FloatArray, shares: FloatArray, classes: Sequence[str]) -> str:
     """Return the accuracy and the most frequent confusion as a sentence."""
     total = float(table.sum())
     headline = f"{percent(float(np.trace(table)) / total)} of {counted(round(total), 'answer')} are right"
@@ -544,9 +544,9 @@ def calibration_figure(
 
     Args:
         bins: (n, 5), for each bin of probabilities: its two ends, the mean stated probability, the share of right
-            answers (all 0 to 1), and the number of answers. Bins without answers are left out.
-        ece: expected calibration error, 0 to 1, where it was measured.
-        brier: Brier score, where it was measured.
+            answers (all 0 to 1), and the number of answers. Bins without answers are omitted.
+        ece: expected calibration error, 0 to 1, None if it is unknown.
+        brier: Brier score, 0 to 1; None if it is unknown.
         title: above the figure; by default the calibration error.
 
     Raises:
@@ -561,7 +561,7 @@ def calibration_figure(
     start, end = 100 * np.clip(table[:, :2].T, 0, 1)
     stated, right, counts = *(100 * table[:, 2:4].T), table[:, 4]
     if not ((table[:, 2:4] >= 0) & (table[:, 2:4] <= 1)).all():
-        raise InputError("What is stated and what is right in a calibration must lie within 0 to 1.")
+        raise InputError("Stated probabilities and shares of right answers in a calibration must lie within 0 to 1.")
     error = None if ece is None else f"Stated probabilities are off by {100 * ece:.1f} points on average"
     headline = error or "How often answers are right, against the probability stated for them"
     figure, (curve_axes, count_axes) = charts(
@@ -606,10 +606,10 @@ def learning_curve_figure(
     Args:
         subjects: (n,) numbers of training people, ascending.
         mean: (n,) accuracy, 0 to 1.
-        low: (n,) lower end of its interval, where it is known,
-        high: (n,) and upper end.
-        band: what the interval is.
-        ceiling: upper bound of the accuracy, where it is known.
+        low: (n,) lower end of the interval, 0 to 1; None if it is unknown.
+        high: (n,) upper end of the interval, 0 to 1; None if it is unknown.
+        band: name of the interval.
+        ceiling: upper bound of the accuracy, 0 to 1; None if it is unknown.
         title: above the figure; by default the first and last accuracy.
 
     Raises:
@@ -660,20 +660,20 @@ def curve_figure(
     """Draw one measure against another, one line per series.
 
     Args:
-        series: for each line its name, empty for none, its (n,) places and its (n,) values.
-        x: what the places are, with their unit,
-        y: and the values.
+        series: name (empty for none), (n,) x values and (n,) y values of each line.
+        x: name and unit of the x values.
+        y: name and unit of the y values.
         title: above the figure; by default y against x.
-        bands: for each series the lower and the upper ends (n,) of a band around it, not-a-number where there is none;
-            None for none.
-        dots: for each series whether it is dots without a line.
-        scales: of places and values; on `probit` shares stand at their normal deviates, and those of 0 and 1 at the
-            edge. What is not positive has no place on `log`.
-        diagonal: draw where both are the same.
-        groups: for each series the number of its group, which chooses colour and marker; None for its own number.
+        bands: lower and upper ends (n,) of a band around each series, NaN where unknown; None for a series without a
+            band.
+        dots: whether each series is drawn as dots without a line.
+        scales: scales of the x and y axes; `probit` draws shares at their normal deviates, and 0 and 1 at the edge;
+            `log` omits numbers that are not positive.
+        diagonal: whether to draw the line of equal values.
+        groups: group number of each series, which selects colour and marker; None for the index of the series.
 
     Raises:
-        InputError: no series or too many, one whose lists are empty or of different lengths, or numbers that have no
+        InputError: no series or too many, a series with empty lists or lists of unequal length, or numbers that have no
             place on their scale.
     """
     if not 1 <= len(series) <= _MOST_CURVES:
@@ -731,7 +731,7 @@ def curve_figure(
     axes.margins(y=0.12)
     axes.set(xscale="log" if scales[0] == "log" else "linear", yscale="log" if scales[1] == "log" else "linear")
     for axis, kind, band_limits in zip((axes.xaxis, axes.yaxis), scales, limits, strict=True):
-        _scaled(axis, kind, band_limits)
+        _set_scale(axis, kind, band_limits)
     if diagonal:
         low = max(axes.get_xlim()[0], axes.get_ylim()[0])
         high = min(axes.get_xlim()[1], axes.get_ylim()[1])
@@ -764,12 +764,12 @@ def _scale_ends(kind: CurveScale, values: Sequence[FloatArray]) -> tuple[float, 
     known = np.concatenate(values)
     known = known[np.isfinite(known)]
     if kind == "probit" and ((known < 0) | (known > 1)).any():
-        raise InputError("On a probit scale stand shares from 0 to 1.")
+        raise InputError("A probit scale needs shares from 0 to 1.")
     if kind != "linear":
         known = known[(known > 0) & ((known < 1) | (kind == "log"))]
     if not len(known):
         if kind == "log":
-            raise InputError("On a logarithmic scale stand numbers above 0, and there are none.")
+            raise InputError("A logarithmic scale needs numbers above 0, and there are none.")
         return 0.01, 0.99
     low, high = float(known.min()), float(known.max())
     return (max(low, _LEAST_SHARE), min(max(high, low), 1 - _LEAST_SHARE)) if kind == "probit" else (low, high)
@@ -785,7 +785,7 @@ def _to_scale(values: FloatArray, kind: CurveScale, limits: tuple[float, float])
     return np.where(values > 0, values, np.nan) if kind == "log" else values
 
 
-def _scaled(axis: Axis, kind: CurveScale, limits: tuple[float, float]) -> None:
+def _set_scale(axis: Axis, kind: CurveScale, limits: tuple[float, float]) -> None:
     """Give an axis its scale and ticks that people read."""
     if kind == "log":
         plain_decades(axis)
@@ -796,7 +796,7 @@ def _scaled(axis: Axis, kind: CurveScale, limits: tuple[float, float]) -> None:
 
         low, high = float(ndtri(limits[0])) - _PROBIT_ROOM, float(ndtri(limits[1])) + _PROBIT_ROOM
         ticks = [share for share in _SHARES if low <= ndtri(share) <= high]
-        # Their words would touch where the whole range is shown.
+        # Their labels would overlap if the full range is shown.
         while len(ticks) > _MOST_TICKS:
             ticks = ticks[::2]
         axis.set_ticks(ndtri(ticks).tolist(), [f"{100 * share:.4g} %" for share in ticks])

@@ -50,12 +50,12 @@ STAGE_WORDS = {
     "final": "after phase 2: pose and shape",
     "dense": "dense",
 }
-"""The moments of a fit whose surfaces are kept, in order, and what they are called."""
+"""Stages of a fit whose surfaces are saved, in order, and their names in words."""
 
 SIGNED = "distance (mm): scan inside (−) or outside (+) of the model"
 UNSIGNED = "distance to the points (mm), which have no inside or outside"
 NOT_SHOWN = "not shown by the scan"
-"""What all figures call the signs of distances, distances to a point cloud, and vertices without a distance."""
+"""Labels of signed distances, of distances to a point cloud, and of vertices without a distance, in all figures."""
 
 INK, GREY, RULE = "#1d1f22", "#5c6068", "#e4e5e8"
 FORWARD, BACKWARD, BARS = "#0072B2", "#D55E00", "#a9c9e2"
@@ -63,11 +63,11 @@ WIDTH, DPI = 960, 160  # layout: pixels of the column, dots per inch
 TITLE, TEXT, SMALL = 12.0, 11.0, 9.5  # layout: type sizes, points
 MOST_PANELS = 48  # limit on the size of a figure
 FEWEST_BINNED = 10
-"""Values of which a histogram tells something; fewer are drawn one by one."""
+"""Smallest number of values of a histogram; fewer are drawn as dots."""
 _GAP, _EDGE = 8, 4  # layout: pixels
 _MOST_LINES = 4  # layout: lines of a caption
 _LEGEND_MARK = 3.6  # layout: width of an entry of a legend without its name, in sizes of its type
-# steps between tick labels, and how many labels fit beside each other
+# steps between tick labels, and how many labels fit next to each other
 _STEPS, _MOST_NUMBERS = (1, 5, 10, 20, 50, 100, 200, 500), 22
 
 
@@ -79,8 +79,8 @@ class Layout:
     """Size and style of figures: for a page, or for print.
 
     Args:
-        chart_width: of charts, pixels of `DPI`.
-        row_width: of rows of pictures, pixels of `DPI`.
+        chart_width: width of charts, pixels of `DPI`.
+        row_width: width of rows of pictures, pixels of `DPI`.
         scale: factor of type sizes, line widths, marker sizes, and heights of charts.
         panel_scale: pixels of a rendered picture for one pixel of `DPI`.
         has_titles: whether figures have a title; in print it is in the caption.
@@ -133,7 +133,7 @@ class Row:
     Args:
         panels: (H, W, 3) pictures.
         captions: one above each panel; empty for none.
-        heading: above the row.
+        heading: text above the row.
     """
 
     panels: Sequence[Image]
@@ -146,7 +146,7 @@ class Scale:
     """A colour bar.
 
     Args:
-        label: what is shown, with its unit.
+        label: name and unit of the values.
         colours: (N, 3).
         low: value of the first colour.
         high: value of the last one.
@@ -213,11 +213,11 @@ def grid(
     """Lay out pictures pixel for pixel in rows, with a key or a scale and a `note` below them.
 
     Args:
-        rows: of pictures.
-        title: above them; None where the page has it already.
-        note: below all.
-        scale: a colour bar, or None.
-        keys: names of colours.
+        rows: rows of pictures.
+        title: text above the rows; None if the page has the title already.
+        note: text below all rows.
+        scale: colour bar, or None.
+        keys: entries of the legend, each a name and a colour.
 
     Raises:
         InputError: there are no pictures.
@@ -337,7 +337,7 @@ def colour_bar(figure: Figure, scale: Scale, top: float, total_h: float) -> None
 
 
 def without_empty_rows(panels: Sequence[Image]) -> list[Image]:
-    """Return images of one row without the white rows of pixels at the top and bottom of all of them."""
+    """Return images of one row without the rows of white pixels at the top and bottom that all images share."""
     used_rows = np.flatnonzero(np.any([(panel < 255).any(axis=(1, 2)) for panel in panels], axis=0))
     if not len(used_rows):
         return list(panels)
@@ -375,13 +375,13 @@ def charts(title: str, heights: Sequence[float], *, note: str = "", columns: int
                 fontsize=size,
                 **cast(Any, text_style),
             )
-    # Where the plots may stand, for `finish`.
+    # The area of the plots, for `finish`.
     cast(Any, figure).plots_within = (0.0, bottom / total, 1.0, 1 - top / total)
     return figure, axes
 
 
 def finish(figure: Figure, **spaces: float) -> Figure:
-    """Style the plots of a chart, and place them so that nothing of them is cut."""
+    """Style the plots of a chart, and place them so that nothing is cut off."""
     for axes in figure.axes:
         if axes.name != "3d" and axes.axison:
             style(axes)
@@ -404,7 +404,7 @@ def _scale_marks(axes: Axes, factor: float) -> None:
 
 
 def style(axes: Axes) -> None:
-    """Give a plot the type and the quiet lines of all of them."""
+    """Set the type sizes and pale lines that all plots share."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.spines[["left", "bottom"]].set_color("#9a9da3")
     axes.tick_params(which="both", colors=INK, labelsize=type_size(SMALL), color="#9a9da3")
@@ -416,7 +416,7 @@ def style(axes: Axes) -> None:
 
 def legend(axes: Axes, **options: Any) -> None:
     """Add the legend of a plot, in fewer columns than `ncols` if these are wider than the figure."""
-    names = [str(one.get_label()) for one in options["handles"]] if "handles" in options else None
+    names = [str(handle.get_label()) for handle in options["handles"]] if "handles" in options else None
     names = axes.get_legend_handles_labels()[1] if names is None else names
     options["ncols"] = legend_columns(names, options.get("ncols", 1))
     cast(Any, axes).legend(
@@ -495,7 +495,7 @@ def height_of(text: str, size: float) -> float:
 def wrap(text: str, width: float, size: float, *, bold: bool = False, max_lines: int = _MOST_LINES) -> str:
     """Wrap `text` to at most `max_lines` lines of similar length, none wider than `width` pixels.
 
-    What is left out ends in `…`.
+    Text that is cut off ends in `…`.
     """
     parts = plain(text).split("\n")
 
@@ -551,7 +551,7 @@ def plain_decades(axis: Axis) -> None:
 
 
 def empty_chart(title: str, text: str) -> Figure:
-    """Return a chart that says why there is nothing in it."""
+    """Return an empty chart with the reason as its text."""
     figure, axes = chart(title, height=1.2)
     axes.text(
         0.5,
@@ -588,7 +588,7 @@ def distance_scale(limit_mm: float, *, signed: bool) -> Scale:
 
 
 def number_axis(axes: Axes, count: int, *, room: float = 0.7) -> None:
-    """Give a plot over the whole numbers 1 to `count` ticks at some of them, and at nothing else."""
+    """Set the ticks of a plot over the integers 1 to `count` at some of the integers, and nowhere else."""
     # One bar as wide as the plot would look like a background.
     aside = room + max(0.0, (5 - count) / 2)
     axes.set_xlim(1 - aside, count + aside)
@@ -602,7 +602,7 @@ ONE_COLUMN_MM, TWO_COLUMNS_MM = 85.0, 174.0
 """Widths of charts, and of rows of pictures, mm: the columns of most journals (Elsevier 90 and 190, Nature 89 and 183,
 PLOS 83 and 173)."""
 _PRINT_SCALE = 0.72  # type of 6.8 to 8 points instead of 9.5 to 11, above the 6 that journals ask for
-_LEAST_DPI, _MOST_DPI = 72, 1200  # legible, and what a rendered panel holds in memory
+_LEAST_DPI, _MOST_DPI = 72, 1200  # limits: legible, and memory of a rendered panel
 
 
 @contextmanager
@@ -617,8 +617,8 @@ def publication_style(dpi: int = 300) -> Generator[None]:
     """
     if not _LEAST_DPI <= dpi <= _MOST_DPI:
         raise InputError(f"The resolution of a figure is {_LEAST_DPI} to {_MOST_DPI} dpi, not {dpi}.")
-    one, two = (round(width / 25.4 * DPI) for width in (ONE_COLUMN_MM, TWO_COLUMNS_MM))
-    token = LAYOUT.set(Layout(one, two, _PRINT_SCALE, dpi / DPI, has_titles=False))
+    one_column, two_columns = (round(width / 25.4 * DPI) for width in (ONE_COLUMN_MM, TWO_COLUMNS_MM))
+    token = LAYOUT.set(Layout(one_column, two_columns, _PRINT_SCALE, dpi / DPI, has_titles=False))
     try:
         yield
     finally:
@@ -628,14 +628,14 @@ def publication_style(dpi: int = 300) -> Generator[None]:
 def save_figure(
     figure: Figure, path: Path, formats: Sequence[str] = ("pdf",), dpi: float | None = None
 ) -> tuple[Path, ...]:
-    """Write a figure in one or more formats, each file whole or not at all, and return their paths.
+    """Write a figure in one or more formats, each file completely or not at all, and return their paths.
 
     Fonts are embedded: as TrueType in PDF, as a subset in SVG, whose text can be searched and edited.
 
     Args:
-        figure: to write.
-        path: of the files, without an ending.
-        formats: of `FORMATS`.
+        figure: figure to write.
+        path: path of the files, without an extension.
+        formats: names from `FORMATS`.
         dpi: resolution of PNG and of pictures inside the others; None for that of the figure.
 
     Raises:

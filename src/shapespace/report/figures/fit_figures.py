@@ -120,15 +120,15 @@ def overlay_figure(fit: StagedFit, *, title: str = "") -> Figure:
 
 
 def signed_maps(fit: StagedFit, stage: str = "final", *, limit_mm: float | None = None, title: str = "") -> Figure:
-    """Draw the distances both ways: on the model to the scan, and on the scan to the model; signed but for points.
+    """Draw the distances from the model to the scan and from the scan to the model; signed if the scan has faces.
 
         result = ss.fit_scan(model, scan)
         figures.signed_maps(StagedFit.of(model, result))
 
     Args:
-        fit: with the stage.
+        fit: fit with the stage.
         stage: `before`, `initial`, `final` or `dense`.
-        limit_mm: where the scale ends; None takes one that nearly all distances keep within.
+        limit_mm: end of the colour scale, mm; None for a limit that contains nearly all distances.
         title: above the figure.
 
     Raises:
@@ -170,7 +170,7 @@ def signed_maps(fit: StagedFit, stage: str = "final", *, limit_mm: float | None 
 
 
 def threshold_figure(fits: StagedFit | Sequence[StagedFit], *, title: str = "") -> Figure:
-    """Draw where the model lies within 2, 4, 6, 8 and 10 mm of the scan (the paper's figure 11), a row a fit.
+    """Draw where the model lies within 2, 4, 6, 8 and 10 mm of the scan (the paper's figure 11), one row per fit.
 
     Raises:
         InputError: no fit is given.
@@ -211,7 +211,7 @@ def threshold_figure(fits: StagedFit | Sequence[StagedFit], *, title: str = "") 
 def distance_histograms(fit: StagedFit, *, title: str = "", bins: int = 60) -> Figure:
     """Draw histograms of the distances of both directions, stage by stage on one scale.
 
-    Distances from the model to the scan stand above each line, those from the scan to the model hang below it. Only
+    Distances from the model to the scan are drawn above each line, those from the scan to the model below it. Only
     vertices that the scan shows count, and scan points within the model's rim.
     """
     distances_by_stage = {
@@ -228,7 +228,7 @@ def distance_histograms(fit: StagedFit, *, title: str = "", bins: int = 60) -> F
     axis_top = _TEXT_ROOM * tallest
     note = "Counted: the vertices that the scan shows, and scan points within the model's rim."
     if any(height[0] > max(_TOWERS * height[1], _TOWERS) for pair in heights.values() for height in pair):
-        note += f" The first bar holds all distances below {mm(float(edges[1]))}, 0 among them."
+        note += f" The first bar contains all distances below {mm(float(edges[1]))}, including 0."
     figure, plots = charts(
         title or f"{short(fit.label)}: closest distances both ways, stage by stage",
         [1.6] * len(distances_by_stage),
@@ -313,8 +313,8 @@ def coefficients_figure(fit: StagedFit, population: FloatArray | None = None, *,
     """Draw the coefficients of a fit in standard deviations, with uncertainty, over those of the population.
 
     Args:
-        fit: gives z, b_stddev and shrinkage.
-        population: (N, K) z of the training set; None draws where 95 % of a normal population lie.
+        fit: fit with z, b_stddev and shrinkage.
+        population: (N, K) z of the training set; None draws the 95 % range of a normal population.
         title: above the figure.
 
     Raises:
@@ -325,9 +325,7 @@ def coefficients_figure(fit: StagedFit, population: FloatArray | None = None, *,
     numbers = np.arange(1, n_shown + 1)
     z = fit.z[:n_shown]
     figure, axes = chart(
-        title
-        or f"{short(fit.label)}: its coefficient{'s, how sure they are' if count > 1 else ', how sure it is'}, "
-        "and what is usual",
+        title or f"{short(fit.label)}: its coefficient{'s' if count > 1 else ''}, with uncertainty and the usual range",
         height=3.2,
     )
     if population is None:
@@ -335,7 +333,7 @@ def coefficients_figure(fit: StagedFit, population: FloatArray | None = None, *,
     else:
         if population.ndim != 2 or population.shape[1] != count:
             raise InputError(
-                f"The population must hold {count} coefficients a shape, as the fit does, not {population.shape}."
+                f"The population must have {count} coefficients per shape, as the fit does, not {population.shape}."
             )
         low, high = np.percentile(population[:, :n_shown], [2.5, 97.5], axis=0)
         axes.bar(numbers, high - low, bottom=low, width=0.9, color="#e3e5e8", label="95 % of the training set")
@@ -397,7 +395,7 @@ def regions_figure(fit: StagedFit, *, title: str = "") -> Figure:
             for name, share in fit.region_shares.items()
             if share > 0
         ],
-        note="In %: share of the model's vertices. What is not blue has only the model, and its neighbours, to go by.",
+        note="In %: share of the model's vertices. Parts that are not blue follow only the model and their neighbours.",
     )
 
 
@@ -410,7 +408,7 @@ def _from_two_sides(fit: StagedFit, layers: Sequence[Sequence[Layer]], captions:
     points = surroundings(fit)
     final = fit.surfaces["final"].vertices
     before = fit.surfaces["before"].vertices if "before" in fit.surfaces else final
-    # Of a start that was near, all is shown; one that was far away would make the rest small.
+    # A start that was near is shown completely; a start far away would make the rest small.
     if np.abs(before.mean(axis=0) - final.mean(axis=0)).max() < _NEAR_START * np.ptp(final, axis=0).max():
         points = np.concatenate([points, before])
     cameras, size = equal_views([(points, yaw) for yaw in _FRONT_AND_SIDE], len(layers))
@@ -459,8 +457,8 @@ def error_curves(fits: Sequence[StagedFit], *, stage: str = "final", title: str 
     """Draw cumulative curves of the share of points within each distance.
 
     Args:
-        fits: for a thin curve each and a thick one of all together, over the vertices that their scans show.
-        stage: of the fits.
+        fits: fits, each drawn as a thin curve over the vertices that its scan shows; a thick curve is that of all fits.
+        stage: stage of the fits.
         title: above the figure.
 
     Raises:
@@ -505,7 +503,7 @@ def error_curves(fits: Sequence[StagedFit], *, stage: str = "final", title: str 
 
 
 def _curve(axes: Any, values: FloatArray, **style: Any) -> None:
-    """Draw the share of sorted `values` up to each of them, in at most 400 steps."""
+    """Draw the cumulative share of sorted `values`, in at most 400 steps."""
     share = np.linspace(0, 1, min(len(values), 400) + 1)
     sample = np.quantile(values, share, method="inverted_cdf") if len(values) > 400 else np.concatenate([[0.0], values])
     axes.plot(

@@ -69,7 +69,7 @@ def deformation_grid_figure(low: FloatArray, high: FloatArray, labels: tuple[str
     Args:
         low: (L, 3) one configuration; z is the same everywhere.
         high: (L, 3) the other.
-        labels: what they are.
+        labels: names of the configurations.
 
     Raises:
         InputError: landmarks that are not planar, or that lie on a line.
@@ -96,9 +96,9 @@ def landmark_vectors_figure(low: FloatArray, high: FloatArray, labels: tuple[str
     top.
 
     Args:
-        low: (L, 3) where the lines start.
-        high: (L, 3) where they end.
-        labels: what the configurations are.
+        low: (L, 3) landmarks at the start of the lines.
+        high: (L, 3) landmarks at the end of the lines.
+        labels: names of the configurations.
     """
     figure, plots, placed = _in_views(np.stack([low, high]), " → ".join(map(short, labels)))
     for axes, (start, end) in zip(plots, placed, strict=True):
@@ -121,12 +121,12 @@ def landmark_map_figure(
     """Draw a number for each landmark as its colour.
 
     Args:
-        points: (L, 3) places.
-        values: (L,); not-a-number is drawn in grey.
-        unit: of the numbers.
-        signed: whether two colours part at zero.
-        limit: where the colours end; None for the largest number.
-        mask: (L,) outside which landmarks are small and pale; None for none.
+        points: (L, 3) positions of the landmarks.
+        values: (L,) numbers; NaN is drawn in grey.
+        unit: unit of the numbers.
+        signed: whether the colour scale diverges at zero.
+        limit: end of the colour scale; None for the largest magnitude, rounded up.
+        mask: (L,) landmarks in full colour, the others are small and pale; None for no mask.
 
     Raises:
         InputError: another number of values or flags than of landmarks, or no finite value.
@@ -188,10 +188,11 @@ def _in_views(
     views = (
         [(label, _first_rotation())]
         if (np.ptp(shapes[:, :, 2]) == 0)
-        else [(one.name, view_rotation(one)) for one in current_orientation().views][:4] or list(_THREE_SIDES)
+        else [(named_view.name, view_rotation(named_view)) for named_view in current_orientation().views][:4]
+        or list(_THREE_SIDES)
     )
     placed = [(shapes @ turn.T)[:, :, :2] for _, turn in views]
-    placed = [one - (one.max(axis=(0, 1)) + one.min(axis=(0, 1))) / 2 for one in placed]
+    placed = [landmarks - (landmarks.max(axis=(0, 1)) + landmarks.min(axis=(0, 1))) / 2 for landmarks in placed]
     figure, plots = _panels([name for name, _ in views], np.concatenate(placed).reshape(-1, 2), below, note)
     return figure, plots, placed
 
@@ -268,7 +269,7 @@ class Morphospace:
 
     Args:
         part: names, axes and groups.
-        arrays: those of the part as float64; `groups` is 0, `nodes` and `edges` are empty where there are none.
+        arrays: arrays of the part as float64; `groups` is 0 and `nodes` and `edges` are empty if the part lacks them.
         faces: (F, 3); None for landmarks.
         grid: number of lines of the grid, and of points of each, after the landmarks in `mean` and `shape_axes`.
         is_planar: whether landmarks lie in the plane z = 0.
@@ -284,7 +285,7 @@ class Morphospace:
     def of(
         part: MorphospacePart, arrays: Mapping[str, npt.NDArray[Any]], damaged: Callable[[str], ShapespaceError]
     ) -> Morphospace:
-        """Return the plot of a part and the arrays of its file; `damaged` makes the error of those that do not fit.
+        """Return the plot of a part and the arrays of its file; `damaged` makes the error for arrays that do not fit.
 
         Raises:
             ShapespaceError: an array is absent, has another shape, or is not finite.
@@ -354,7 +355,7 @@ def _with_grid(space: Morphospace) -> Morphospace:
 
 
 def hull(points: FloatArray) -> FloatArray:
-    """Return the corners of the convex hull of points (n, 2), or the points where they have no area."""
+    """Return the corners of the convex hull of points (n, 2), or the points themselves if they have no area."""
     try:
         return points[ConvexHull(points).vertices]
     except (QhullError, ValueError):

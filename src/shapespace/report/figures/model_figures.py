@@ -50,8 +50,8 @@ SHARES = (0.90, 0.95, 0.98, 0.99)
 
 _LANDMARK = (0.78, 0.20, 0.14)  # red, sRGB from 0 to 1
 _QUALITY = {
-    "compactness": ("Compactness: share of the variance held", "share of the variance (%)"),
-    "generalisation": ("Generalisation: error on shapes left out", "mean error (mm)"),
+    "compactness": ("Compactness: share of the variance", "share of the variance (%)"),
+    "generalisation": ("Generalisation: error on held-out shapes", "mean error (mm)"),
     "specificity": ("Specificity: distance of random shapes from real ones", "mean distance (mm)"),
     "reconstruction": ("Reconstruction: error on unseen shapes that were given", "mean error (mm)"),
 }
@@ -61,11 +61,11 @@ _COLOURS, _BANDS = (FORWARD, BACKWARD), (BARS, "#f2c6a5")
 
 
 def mean_figure(model: ShapeModel, *, title: str = "") -> Figure:
-    """Draw the mean shape from three sides, with the model's landmarks where it has any.
+    """Draw the mean shape from three sides, with the model's landmarks if it has any.
 
     Args:
         model: the shape space.
-        title: above the figure; by default it says how many shapes the mean is of.
+        title: text above the figure; by default the number of shapes of the mean.
     """
     mean = model.mesh()
     layers = [Layer(mean)]
@@ -86,17 +86,17 @@ def mean_figure(model: ShapeModel, *, title: str = "") -> Figure:
 def modes_figure(model: ShapeModel, modes: int = 5, deviations: float = 3.0, *, title: str = "") -> Figure:
     """Draw the first modes (the paper's figures 2 and 3).
 
-    A row a mode: the mean less and plus `deviations` standard deviations of it, and how far each vertex then moves; one
-    camera and one scale for all rows.
+    Each row shows one mode: the mean minus and plus `deviations` standard deviations, and the displacement of each
+    vertex. All rows share one camera and one scale.
 
     Args:
         model: the shape space.
-        modes: how many to draw at most.
-        deviations: how many standard deviations to each side.
+        modes: largest number of modes.
+        deviations: standard deviations to each side.
         title: above the figure.
 
     Raises:
-        InputError: no mode is asked for, or deviations that are not positive.
+        InputError: fewer than one mode, or deviations that are not positive.
     """
     if modes < 1 or not deviations > 0:
         raise InputError(f"There is nothing to draw of {modes} modes at {deviations} standard deviations.")
@@ -129,17 +129,17 @@ def modes_figure(model: ShapeModel, modes: int = 5, deviations: float = 3.0, *, 
     of_each = f"{deviations:g} standard deviation{'s' * (deviations != 1)}"
     return grid(
         rows,
-        title=title or f"What {_name_modes(n_shown, model.n_modes)} to the mean",
+        title=title or f"Effect of {_name_modes(n_shown, model.n_modes)} on the mean",
         scale=Scale(f"how far a point moves at {of_each} (mm)", SEQUENTIAL, 0.0, top),
     )
 
 
 def _name_modes(n_shown: int, count: int) -> str:
     if count == 1:
-        return "the one mode does"
+        return "the one mode"
     if n_shown == count:
-        return f"each of the {count} modes does"
-    return f"the first of {count} modes does" if n_shown == 1 else f"the first {n_shown} of {count} modes do"
+        return f"each of the {count} modes"
+    return f"the first of {count} modes" if n_shown == 1 else f"the first {n_shown} of {count} modes"
 
 
 def mode_displacement(model: ShapeModel, mode: int, deviations: float = 1.0) -> FloatArray:
@@ -171,25 +171,25 @@ def mode_animation(
 
     Args:
         model: the shape space.
-        mode: which, from 0.
-        deviations: how many standard deviations to each side.
-        frames: of one period, at least 4.
-        width: of the picture in pixels.
-        yaw_deg: how far the shape is turned from the front.
-        milliseconds: that a frame stands.
+        mode: index of the mode, from 0.
+        deviations: standard deviations to each side.
+        frames: number of frames of one period, at least 4.
+        width: width of the picture in pixels.
+        yaw_deg: rotation of the shape from the front, degrees.
+        milliseconds: duration of a frame, ms.
 
     Raises:
         InputError: the model has no such mode, or there are too few frames.
     """
     if frames < 4 or milliseconds < 1:
-        raise InputError(f"An animation needs 4 frames or more that stand for a while, not {frames}.")
+        raise InputError(f"An animation needs 4 frames or more of 1 ms or more, not {frames} of {milliseconds} ms.")
     move = mode_displacement(model, mode, 1.0)
     mean = model.mesh()
     camera_view = view(
         np.concatenate([mean.vertices + sign * deviations * move for sign in (-1, 1)]), 1, yaw_deg=yaw_deg, width=width
     )
     forth = [
-        _labelled(
+        _draw_label(
             render(
                 Layer(mean.with_vertices(mean.vertices + z * move)), camera=camera_view.camera, size=camera_view.size
             ),
@@ -214,7 +214,7 @@ def mode_animation(
     return stream.getvalue()
 
 
-def _labelled(image: Image, name: str, z: float, deviations: float) -> PillowImage.Image:
+def _draw_label(image: Image, name: str, z: float, deviations: float) -> PillowImage.Image:
     """Draw the mode number and a position marker below an image."""
     height, width = image.shape[:2]
     type_size = max(11, round(width / 19))
@@ -236,7 +236,7 @@ def _labelled(image: Image, name: str, z: float, deviations: float) -> PillowIma
 
 
 def spectrum_figure(model: ShapeModel, *, shares: Sequence[float] = SHARES, title: str = "") -> Figure:
-    """Draw how much variance the first modes hold, and how many it takes for each of `shares`."""
+    """Draw the cumulative variance of the modes, and the number of modes needed for each of `shares`."""
     cumulative = model.cumulative_variance
     modes_needed = {share: model.modes_for_variance(share) for share in shares}
     reached = [count for count in modes_needed.values() if count is not None]
@@ -248,9 +248,9 @@ def spectrum_figure(model: ShapeModel, *, shares: Sequence[float] = SHARES, titl
     figure, axes = chart(
         title
         or (
-            f"How many modes the variance of {shapes} needs"
+            f"Number of modes for the variance of {shapes}"
             if len(cumulative) > 1
-            else f"How much of the variance of {shapes} the one mode holds"
+            else f"Share of the variance of {shapes} in the one mode"
         ),
         height=3.3,
     )
@@ -283,13 +283,13 @@ def quality_figure(quality: Quality | Mapping[str, object], *, title: str = "") 
     """Draw compactness, generalisation, specificity and other measures present against the number of modes.
 
     Args:
-        quality: from `compactness` (shares of the variance, 0 to 1), `generalisation`, `specificity` and
-            `reconstruction` (mm) to a list with one number for 1, 2, 3 and so on modes, or to a mapping of `modes`,
-            `mean` and, if known, `stddev` or `low` and `high`; those of `others` are drawn beside it.
-        title: above the figure; by default it says what is drawn.
+        quality: a `Quality`, or a mapping from `compactness` (shares of the variance, 0 to 1), `generalisation`,
+            `specificity` and `reconstruction` (mm) to a list with one number for 1, 2, 3 and so on modes, or to a
+            mapping of `modes`, `mean` and, if known, `stddev` or `low` and `high`; `others` are drawn for comparison.
+        title: text above the figure; by default a description of its content.
 
     Raises:
-        InputError: none of them is there, or one is no such list.
+        InputError: no measure is present, or a measure is not such a list.
     """
     if not isinstance(quality, Quality):
         try:
@@ -301,7 +301,7 @@ def quality_figure(quality: Quality | Mapping[str, object], *, title: str = "") 
     sizes = [item.generalisation_by_shapes for item in qualities]
     if not measures:
         raise InputError(f"There is nothing to draw: give at least one of {', '.join(_QUALITY)}.")
-    curves_by_measure = {key: [_of(key, item) for item in qualities] for key in measures}
+    curves_by_measure = {key: [_measure_lines(key, item) for item in qualities] for key in measures}
     largest_mode_count = int(
         max(modes.max() for curves in curves_by_measure.values() for lines in curves for modes, *_ in lines.values())
     )
@@ -328,14 +328,14 @@ def quality_figure(quality: Quality | Mapping[str, object], *, title: str = "") 
 _Line: TypeAlias = tuple[FloatArray, FloatArray, FloatArray | None, FloatArray | None]
 
 
-def _of(key: str, quality: Quality) -> dict[str, _Line]:
+def _measure_lines(key: str, quality: Quality) -> dict[str, _Line]:
     """Return the curves of a measure that are present: by surface or unnamed, and by vertices."""
     by_surface, by_vertices = getattr(quality, key), getattr(quality, f"{key}_vertices", None)
     out: dict[str, _Line] = {}
     if by_surface is not None:
-        out["surface" if by_vertices is not None else ""] = _measured(key, by_surface)
+        out["surface" if by_vertices is not None else ""] = _measured_line(key, by_surface)
     if by_vertices is not None:
-        out["vertices"] = _measured(key, by_vertices)
+        out["vertices"] = _measured_line(key, by_vertices)
     return out
 
 
@@ -378,7 +378,7 @@ def _legend_above(axes: Axes) -> None:
         legend_above(axes, 0.2 * -(-count // 2), loc="upper right", ncols=2)
 
 
-def _measured(key: str, value: Measured | tuple[float, ...]) -> _Line:
+def _measured_line(key: str, value: Measured | tuple[float, ...]) -> _Line:
     """Return numbers of modes, the measure for each, and where its band begins and ends if known, (n,) each."""
     measured = value if isinstance(value, Measured) else Measured(mean=value)
     mean = np.array(measured.mean)
@@ -388,5 +388,5 @@ def _measured(key: str, value: Measured | tuple[float, ...]) -> _Line:
         low, high = mean - np.array(measured.stddev), mean + np.array(measured.stddev)
     curves = (modes, *(band for band in (low, high, measured.stddev) if band is not None))
     if not len(mean) or any(len(part) != len(mean) for part in curves):
-        raise InputError(f"The {key} of a model must be a list of numbers, one a number of modes.")
+        raise InputError(f"The {key} of a model must be a list of numbers, one per number of modes.")
     return modes, mean, low, high

@@ -53,8 +53,8 @@ def distributions_figure(values: Mapping[str, FloatArray], trusted: Any, *, titl
     """Draw histograms of measures, stacked by trusted and other fits.
 
     Args:
-        values: in words -> (n,); those that are not finite are left out.
-        trusted: (n,) whether a fit is.
+        values: (n,) values of each measure, by its name in words; values that are not finite are omitted.
+        trusted: (n,) whether each fit is trusted.
         title: above the figure.
 
     Raises:
@@ -88,7 +88,7 @@ def distributions_figure(values: Mapping[str, FloatArray], trusted: Any, *, titl
         else:
             axes.hist(parts, edges.tolist(), stacked=True, color=[FORWARD, BACKWARD], label=["converged", "others"])
             axes.set_ylabel("fits")
-        axes.set(xlabel=_wrapped(name), xlim=(edges[0], edges[-1]))
+        axes.set(xlabel=_wrap_label(name), xlim=(edges[0], edges[-1]))
         middle = float(np.median(distances[known & trusted])) if (known & trusted).any() else np.nan
         if np.isfinite(middle):
             axes.axvline(middle, color=INK, lw=1.2, ls="--")
@@ -101,7 +101,7 @@ def distributions_figure(values: Mapping[str, FloatArray], trusted: Any, *, titl
     return finish(figure)
 
 
-def _wrapped(name: str, max_length: int = 28) -> str:
+def _wrap_label(name: str, max_length: int = 28) -> str:
     return escaped("\n".join(textwrap.wrap(name, max_length)))
 
 
@@ -185,13 +185,13 @@ def over_time_figure(
 
     Args:
         times: (n,) numbers, or seconds since 1970.
-        edges: of the stretches that they are drawn by.
-        measures: in words -> (n,).
+        edges: edges of the intervals of `times`, each drawn as one point.
+        measures: (n,) values of each measure, by its name in words.
         untrusted: (n,) whether a fit is not trusted.
         is_time: whether `times` are times.
-        name: of what they are.
+        name: name of the time or number.
         title: above the figure.
-        lines: groups of fits, each with its name and which they are, drawn as a line each on the first measure.
+        lines: name and (n,) membership of each group of fits with a line of its own in the first plot.
 
     Raises:
         InputError: there is nothing to draw.
@@ -217,7 +217,7 @@ def over_time_figure(
                     label=escaped(short(line_name, 18)),
                 )
             legend_above(axes, 0.3, loc="upper left", ncols=4)
-        axes.set_ylabel(_wrapped(words, 16))
+        axes.set_ylabel(_wrap_label(words, 16))
     axes = plots[len(finite)]
     axes.bar(
         middles,
@@ -234,7 +234,7 @@ def over_time_figure(
 
 
 def _quantiles(places: Any, values: FloatArray, count: int) -> FloatArray:
-    """Return (3, count) the 5 %, 50 % and 95 % quantiles of the values at each place; not-a-number of too few."""
+    """Return (3, count) the 5 %, 50 % and 95 % quantiles of the values at each place; NaN for too few values."""
     out = np.full((3, count), np.nan)
     known = (places >= 0) & np.isfinite(values)
     order = np.argsort(places[known], kind="stable")
@@ -261,9 +261,9 @@ def levels_figure(groups: Sequence[tuple[str, Any]], values: FloatArray, *, word
     """Draw the median and the middle 50 and 90 % of a measure for each of some groups of fits.
 
     Args:
-        groups: name and which fits (n,) are in it.
-        values: (n,).
-        words: what they are.
+        groups: name and (n,) membership of each group.
+        values: (n,) values of the measure.
+        words: name and unit of the measure.
         title: above the figure.
 
     Raises:
@@ -297,9 +297,9 @@ class Coefficients:
     """The coefficients of one scan.
 
     Args:
-        name: of the scan.
-        expression: its label, which gives its colour; empty for none.
-        intensity: 0 for neutral to 1, which gives its size.
+        name: name of the scan.
+        expression: label of the scan, which selects its colour; empty for none.
+        intensity: 0 for neutral to 1, which selects the size of its mark.
         b: (K,) mm.
         z: (K,) in standard deviations of the model.
     """
@@ -330,7 +330,7 @@ def scatter_matrix(points: Sequence[Coefficients], modes: int = 4, *, title: str
     handles = _handles(groups)
     if n_shown == 1:
         figure, axes = chart(heading, height=2.8)
-        _spread(axes, b[:, 0], groups)
+        _draw_distribution(axes, b[:, 0], groups)
         axes.set(xlabel="b1 (mm)", ylabel="scans")
         if handles:
             legend(axes, handles=handles, loc="upper right", handlelength=1.0)
@@ -345,7 +345,7 @@ def scatter_matrix(points: Sequence[Coefficients], modes: int = 4, *, title: str
                 axes.set_axis_off()
                 continue
             if c == r:
-                _spread(axes, b[:, c], groups)
+                _draw_distribution(axes, b[:, c], groups)
                 axes.set_yticks([])
             else:
                 for _, marker_style, scores in groups:
@@ -378,7 +378,7 @@ def b_plane(
     """Draw b1 against b2 (figure 9), one colour per expression, with larger markers for stronger expressions.
 
     Args:
-        scans: expressive ones.
+        scans: scans of expressions.
         title: above the figure.
         neutral: the neutral face, through which a line is drawn for each expression; None draws no lines.
 
@@ -387,7 +387,7 @@ def b_plane(
     """
     b = _stack_coefficients(scans)
     if b.shape[1] < 2:
-        raise InputError("b1 against b2 needs two coefficients a scan, but there is only one.")
+        raise InputError("b1 against b2 needs two coefficients per scan, but there is only one.")
     figure, axes = chart(title or "Each expression runs along its own line: b1 and b2", height=4.4)
     groups = _groups(scans)
     for _, marker_style, scores in groups:
@@ -427,7 +427,7 @@ def b_space(
     """
     b = _stack_coefficients(scans)
     if b.shape[1] < 3:
-        raise InputError(f"b1, b2 and b3 need three coefficients a scan, but there are only {b.shape[1]}.")
+        raise InputError(f"b1, b2 and b3 need three coefficients per scan, but there are only {b.shape[1]}.")
     coefficients = np.stack([scan.b[:3] for scan in (*scans, *([neutral] if neutral else []))])
     low, high = coefficients.min(axis=0), coefficients.max(axis=0)
     room = 0.06 * np.maximum(high - low, 1e-9 + 0.01 * float((high - low).max()))
@@ -493,7 +493,7 @@ def _style_space(axes: Any, low: FloatArray, high: FloatArray) -> float:
     axes.zaxis.set_rotate_label(False)
     axes.zaxis.label.set_rotation(90)
     axes.tick_params(labelsize=type_size(SMALL - 2), colors=GREY, pad=-1)
-    # Of the three, only numbers beside an upright axis reach towards it, its label and the other panel.
+    # Of the three, only the numbers of an upright axis reach towards it, its label and the other panel.
     wider = _wider_than_three(axes.zaxis)
     axes.tick_params(axis="z", pad=wider / 2 - 1)
     axes.zaxis.labelpad = 2 + 0.6 * wider
@@ -548,7 +548,7 @@ def _handle(marker_style: Mapping[str, Any], name: str, **style: Any) -> Line2D:
 def _handles(
     groups: Sequence[tuple[str, dict[str, Any], list[int]]], neutral: Coefficients | None = None
 ) -> list[Line2D]:
-    """Return the entries of a legend: the labels, where there are any, and the neutral face."""
+    """Return the entries of a legend: the labels, if there are any, and the neutral face."""
     plus = [] if neutral is None else [_handle({"marker": "+", "color": INK}, "neutral", mew=2.6)]
     if not any(name for name, _, _ in groups):
         return plus
@@ -559,7 +559,7 @@ def _handles(
     return out + plus
 
 
-def _spread(axes: Axes, values: FloatArray, groups: Sequence[tuple[str, dict[str, Any], list[int]]]) -> None:
+def _draw_distribution(axes: Axes, values: FloatArray, groups: Sequence[tuple[str, dict[str, Any], list[int]]]) -> None:
     """Draw the distribution of `values` (n,) per label; as dots if there are few."""
     if len(values) < FEWEST_BINNED:
         for _, marker_style, scores in groups:

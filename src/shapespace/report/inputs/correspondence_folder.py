@@ -33,7 +33,7 @@ from shapespace.types import BoolArray, FloatArray, Mesh, Similarity, are_same_t
 _FEWEST_VERTICES = 3  # a triangle
 _ONE_UNIT = 5.0  # ratio of scales; mm, cm and m differ by 10 or more
 _POSED_ALIKE = 0.8  # strength of the mean rotation above which the scans share a pose
-_POSES = 24  # surfaces that tell how the scans stand
+_POSES = 24  # surfaces that determine the pose of the mean shape
 _OPEN_SHARE = 0.15  # share of the area that faces one way in an open surface
 
 
@@ -43,8 +43,8 @@ class PlacedSurface:
 
     Args:
         vertices: (V, 3) in the frame of `Corresponded.mean`, size divided out; not-a-number where missing.
-        T_scan_mean: from that frame to the scan's own.
-        position_std: (V,) `Mesh.position_std` as a share of the object's size; None where the file has none.
+        T_scan_mean: transformation from that frame to the scan's own.
+        position_std: (V,) `Mesh.position_std` as a share of the object's size; None if the file has none.
     """
 
     vertices: FloatArray
@@ -62,10 +62,10 @@ class Population:
     """Summary of all readable surfaces.
 
     Args:
-        names: of the scans.
-        seen_count: (V,) how many of them show each vertex.
+        names: names of the scans.
+        seen_count: (V,) number of scans that show each vertex.
         sizes: (N,) RMS distance of the surfaces from their middle, in the scans' own units.
-        unread: name to the reason, of those that cannot be read.
+        unread: reasons by the names of the scans that cannot be read.
         position_std: (V,) RMS of `PlacedSurface.position_std` over the scans that show a vertex; None if a file has
             none.
     """
@@ -86,11 +86,11 @@ class Corresponded:
     """Output folder of a correspondence.
 
     Args:
-        folder: that `shapespace correspond` wrote.
+        folder: folder that `shapespace correspond` wrote.
 
     Raises:
         FileError: correspondence.json or the mean shape cannot be read.
-        FileFormatError: one of them is damaged.
+        FileFormatError: correspondence.json or the mean shape is damaged.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -99,7 +99,7 @@ class Corresponded:
         self.run = read(CorrespondenceRecord, self.folder.json(summary), summary, CORRESPOND_AGAIN)
         self._mean = self.folder.mesh(CorrespondenceRecord.MEAN)
         if self._mean.faces is None or not np.isfinite(self._mean.vertices).all():
-            raise FileFormatError(f"{CorrespondenceRecord.MEAN} is no whole surface; {CORRESPOND_AGAIN}.")
+            raise FileFormatError(f"{CorrespondenceRecord.MEAN} is not a complete surface; {CORRESPOND_AGAIN}.")
         self.unread: dict[str, str] = {}
         self.records = {record.name: record for record in map(self._record, self._record_files()) if record is not None}
         self.turn = np.eye(3)
@@ -154,7 +154,8 @@ class Corresponded:
             )
         if observed_mask(mesh.vertices).sum() < _FEWEST_VERTICES:
             raise FileFormatError(
-                f"{name}{CorrespondRecord.SURFACE} has hardly a vertex that is not missing; {CORRESPOND_AGAIN}."
+                f"{name}{CorrespondRecord.SURFACE} has fewer than {_FEWEST_VERTICES} vertices that are not missing; "
+                f"{CORRESPOND_AGAIN}."
             )
         return replace(mesh, faces=self._mean.faces)
 
@@ -184,7 +185,7 @@ class Corresponded:
         """Return the scan of a record, reflected if it is mirrored, if it is in the same place with the same content.
 
         Raises:
-            ScanNotFoundError: it is not, or cannot be read.
+            ScanNotFoundError: the scan was moved or changed, or cannot be read.
         """
         if record.path and not record.hash:
             raise ScanNotFoundError("the scan cannot be read.")
@@ -196,12 +197,12 @@ class Corresponded:
         if self._is_upright:
             return
         turns: list[FloatArray] = []
-        for record in self._of_known_pose():
-            with contextlib.suppress(ShapespaceError):  # `population` reports what cannot be read
+        for record in self._records_for_pose():
+            with contextlib.suppress(ShapespaceError):  # `population` reports unreadable surfaces
                 turns.append(self.placed(record.name).T_scan_mean.rotation)
         self._turn_by(turns)
 
-    def _of_known_pose(self) -> list[CorrespondRecord]:
+    def _records_for_pose(self) -> list[CorrespondRecord]:
         """Return the records of the surfaces whose poses turn the mean shape upright."""
         return self.corresponding[:: max(1, len(self.corresponding) // _POSES)]
 
@@ -215,7 +216,7 @@ class Corresponded:
             on_scan: called after each scan.
         """
         if self._population is None:
-            turns, posed = list[FloatArray](), {record.name for record in self._of_known_pose()}
+            turns, posed = list[FloatArray](), {record.name for record in self._records_for_pose()}
             counts = np.zeros(len(self._mean.vertices), dtype=np.int64)
             names: list[str] = []
             sizes: list[float] = []
@@ -272,11 +273,11 @@ class Corresponded:
             if record.name != name:
                 raise FileFormatError(f"{file} is the record of another scan, {record.name}; {CORRESPOND_AGAIN}.")
             if any(isinstance(value, float) and not 0 <= value < math.inf for value in structs.astuple(record)):
-                raise FileFormatError(f"{file} is damaged: it holds a number that none can be; {CORRESPOND_AGAIN}.")
+                raise FileFormatError(f"{file} is damaged: a number is negative or not finite; {CORRESPOND_AGAIN}.")
         except ShapespaceError as error:
             self.unread[printable(name)] = str(error)
             return None
-        # A report is mailed and a viewer has visitors: neither is to tell where the scans lie on this machine.
+        # A report is mailed and a viewer has visitors: neither may reveal the folders of this machine.
         return structs.replace(record, reason=without_folders(record.reason))
 
 
@@ -297,11 +298,12 @@ def drawable(mesh: Mesh, values: FloatArray | None = None) -> tuple[Mesh, FloatA
 def upright(mean: Mesh, turns: Sequence[FloatArray] = ()) -> FloatArray:
     """Return the rotation (3, 3) that brings the mean shape upright: +y up, its front along +z.
 
-    Where the scans stand alike, it is how they stand, as everywhere else. Otherwise the longest axis stands upright
-    with the narrower end below, and the front is where an open surface faces, or the shortest axis of a closed one.
+    If the scans share a pose, the mean shape gets the mean of their poses. Otherwise its longest axis is vertical, with
+    the narrower end below, and its front is the side to which an open surface opens, or the shortest axis if it is
+    closed.
 
     Args:
-        mean: the surface.
+        mean: mean shape.
         turns: (3, 3) rotations from its frame to those of the scans.
     """
     if turns:
@@ -333,8 +335,8 @@ class Concern:
     """Reasons to review a scan in correspondence.
 
     Args:
-        weight: how much it stands out, 0 for not at all.
-        reasons: in words, the weightiest first.
+        weight: need for review, 0 for none.
+        reasons: reasons in words, the most severe first.
     """
 
     weight: float = 0.0
@@ -343,7 +345,7 @@ class Concern:
     @property
     def text(self) -> str:
         """Reasons as a sentence."""
-        return sentence("; ".join(self.reasons)) if self.reasons else "Nothing about it stands out."
+        return sentence("; ".join(self.reasons)) if self.reasons else "No problems detected."
 
 
 def concerns_of(folder: Corresponded) -> dict[str, Concern]:

@@ -1,6 +1,6 @@
 """Large sets of fits as columns, with the metadata of their list and unusual fits, read in one stream.
 
-Of each fit some forty bytes and its coefficients are kept (float32), no record and no surface.
+Some forty bytes and the coefficients (float32) of each fit stay in memory, not its record and not its surface.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ MEASURES: Mapping[str, str] = {
 
 MOST_LEVELS, MOST_BINS = 24, 40  # layout: rows of a table and bins of a figure
 FEWEST = 20
-"""Fits of a level or a stretch of time below which it is not reported."""
+"""Fits of a level or an interval below which it is not reported."""
 
 _MOST_VALUES = 500  # distinct texts of a column that counts as a category
 _FEWEST_NUMBERS = 12  # distinct values of a column that counts as numeric
-# a group stands out: standard errors, share of the typical value, and shift in sd of the coefficients
+# limits above which a group differs: standard errors, share of the typical value, and shift in sd of the coefficients
 _SIGNS, _LEAST_SHARE, _LEAST_SHIFT = 4.0, 0.1, 0.3
 _NUMBERS = re.compile(r"\d+(?:[.,]\d+)*")
 _NAMES = re.compile(r"\S*[\\/.]\S*[^\s.,;:]")
@@ -48,11 +48,11 @@ class ListedColumn:
     """A metadata column of the list of scans.
 
     Args:
-        name: its head.
+        name: head of the column.
         kind: `time` and `number` have `values`, `level` has `codes`.
-        values: (n,) float64: numbers, or seconds since 1970; not-a-number where there is none.
-        codes: (n,) int32: which of `levels`; -1 where there is none.
-        levels: in order.
+        values: (n,) float64: numbers, or seconds since 1970; NaN if unknown.
+        codes: (n,) int32: index in `levels`; -1 if unknown.
+        levels: distinct values in order.
     """
 
     name: str
@@ -83,7 +83,7 @@ class ListedColumn:
         ]
 
     def edges(self) -> FloatArray:
-        """Return where stretches of times or numbers begin, and where the last ends; of whole numbers at such."""
+        """Return the edges (n + 1,) of intervals of times or numbers; integers if all numbers are integers."""
         known = self.values[np.isfinite(self.values)]
         low, high = float(known.min()), float(known.max())
         max_bins = min(MOST_BINS, max(2, len(known) // FEWEST))
@@ -104,14 +104,14 @@ class Group:
     """Difference between the fits of one level, or one interval, and all fits.
 
     Args:
-        name: of it.
-        count: of its fits.
-        untrusted: share of them that failed, are doubtful or stopped at the limit.
-        error_mm: median of the errors that its trusted fits expect of themselves.
-        error_off_mm: by how much that lies above the median of all.
-        mode: number of the coefficient whose mean differs most from that of all, 0 for none,
-        shift: and by how much, in standard deviations of the model.
-        stands_out: sentences on what is more than chance, and large.
+        name: name of the level or interval.
+        count: number of fits in the group.
+        untrusted: share of the fits that failed, are doubtful or stopped at the limit.
+        error_mm: median expected vertex error of the trusted fits, mm.
+        error_off_mm: difference of `error_mm` from the median of all fits, mm.
+        mode: number of the coefficient whose mean differs most from that of all fits, 0 for none.
+        shift: difference of the mean of that coefficient, in standard deviations of the model.
+        stands_out: sentences on differences that are large and more than chance.
     """
 
     name: str
@@ -128,10 +128,10 @@ class Population:
     """The fits of a folder by column.
 
     Args:
-        results: of the folder.
+        results: results of the folder.
 
     Raises:
-        InputError: none of them can be read.
+        InputError: none of the fits can be read.
     """
 
     def __init__(self, results: Results) -> None:
@@ -160,7 +160,7 @@ class Population:
             for key, counts in self.origins.items():
                 counts.update(value for value in rows[key] if value)
             self.models.update(value for value in rows["model_hash"] if value)
-            models.append(_coded(rows["model_hash"], codes_of_models, 2**31))
+            models.append(_encode_texts(rows["model_hash"], codes_of_models, 2**31))
             numbers = {key: np.array(rows[key], dtype=np.float64) for key in _READ}
             measures["expected_error_mm"].append(numbers["expected_error_mm"])
             for key, direction in (("to_scan_mm", "model_to_scan"), ("to_model_mm", "scan_to_model")):
@@ -171,12 +171,12 @@ class Population:
             measures["seen_percent"].append(100 * numbers["model_seen_share"])
             z.append(np.array([rows[f"z{k}"] for k in range(1, n_modes + 1)], dtype=np.float32).T.reshape(-1, n_modes))
             for column, (codes, chunks) in coded_columns.items():
-                chunks.append(_coded(rows[column], codes, _MOST_VALUES * 400))
+                chunks.append(_encode_texts(rows[column], codes, _MOST_VALUES * 400))
         if not self.names:
             raise InputError(f"{results.folder}: none of its fits can be read; {'; '.join(results.problems[:1])}")
         self.status = np.frombuffer(bytes(statuses), dtype=np.uint8)
         self.measures = {key: np.concatenate(parts) for key, parts in measures.items()}
-        # Coefficients of other models mean something else.
+        # Coefficients of other models are not comparable.
         commonest_model = codes_of_models.get(self.models.most_common(1)[0][0], 0) if self.models else 0
         self.z = np.concatenate(z)
         self.z[np.concatenate(models) != commonest_model] = np.nan
@@ -232,7 +232,7 @@ class Population:
         ]
 
     def compared(self, column: ListedColumn) -> Iterator[Group]:
-        """Yield how the fits of each level, or stretch, of a column differ from all."""
+        """Yield the difference between the fits of each level, or interval, of a column and all fits."""
         trusted, errors = self.trusted, self.measures["expected_error_mm"]
         known = errors[trusted & np.isfinite(errors)]
         middle = float(np.median(known)) if len(known) else np.nan
@@ -278,7 +278,7 @@ class Population:
         for status, reason in zip(statuses, reasons, strict=True):
             if status == "converged":
                 continue
-            # Reasons differ by names and numbers, which say nothing about how often they occur.
+            # Reasons differ by names and numbers, which must not split the count of a reason.
             plain = _NUMBERS.sub("…", _NAMES.sub("…", reason or "no reason given"))[:200]
             if (status, plain) not in self.n_reasons and len(self.n_reasons) >= _MOST_REASONS:
                 plain = "another reason"
@@ -329,7 +329,7 @@ def _code(status: str) -> int:
     return ORDER_OF_CONCERN.index(status) if status in ORDER_OF_CONCERN else ORDER_OF_CONCERN.index("unreadable")
 
 
-def _coded(texts: Sequence[str | None], codes: dict[str, int], max_levels: int) -> npt.NDArray[np.int32]:
+def _encode_texts(texts: Sequence[str | None], codes: dict[str, int], max_levels: int) -> npt.NDArray[np.int32]:
     """Return the index of each text in `codes`, which grows; -1 for missing ones and beyond `max_levels` distinct
     texts.
     """
@@ -341,7 +341,7 @@ def _coded(texts: Sequence[str | None], codes: dict[str, int], max_levels: int) 
 
 
 def _mean(z: npt.NDArray[np.float32]) -> FloatArray:
-    """Return (K,) means, not-a-number where there is nothing."""
+    """Return (K,) means, NaN without values."""
     known = np.isfinite(z)
     count = known.sum(axis=0)
     return np.where(count > 0, np.where(known, z, 0).sum(axis=0, dtype=np.float64) / np.maximum(count, 1), np.nan)

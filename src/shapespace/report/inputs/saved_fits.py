@@ -60,7 +60,7 @@ class Folder:
     again: str = _AGAIN
 
     def path(self, name: object) -> Path:
-        """Return the file called `name`, as the folder was named by the user.
+        """Return the path of the file `name` in this folder, which is not resolved.
 
         Raises:
             FileFormatError: it is no name, or it leads out of the folder.
@@ -89,15 +89,15 @@ class Folder:
         with self._named_shortly():
             content: object = json_at(path, self.again)
             if not isinstance(content, dict):
-                raise FileFormatError(f"{path} does not hold a JSON object; {self.again}.")
+                raise FileFormatError(f"{path} does not contain a JSON object; {self.again}.")
         return cast(dict[str, Any], _printable(cast(object, content)))
 
     def arrays(self, name: object) -> dict[str, npt.NDArray[Any]]:
-        """Return the arrays of an .npz file by name; no pickles, nothing larger than it says.
+        """Return the arrays of an .npz file by name; pickles, and arrays larger than the file declares, are rejected.
 
         Raises:
             FileError: it cannot be read.
-            FileFormatError: it is damaged, or declares arrays that it does not hold.
+            FileFormatError: it is damaged, or declares arrays that it does not contain.
         """
         with self._named_shortly():
             return arrays_at(self.path(name), self.again)
@@ -114,7 +114,7 @@ class Folder:
 
     @contextmanager
     def _named_shortly(self) -> Generator[None]:
-        # A report is mailed and a viewer has visitors: neither is to tell where the folder lies on this machine.
+        # A report is mailed and a viewer has visitors: neither may reveal the folders of this machine.
         try:
             yield
         except ShapespaceError as error:
@@ -144,17 +144,17 @@ class SavedFit:
 
     @property
     def status(self) -> str:
-        """`converged`, `max_iterations`, `doubtful` or `failed`; `unreadable` where the record is."""
+        """`converged`, `max_iterations`, `doubtful` or `failed`; `unreadable` if the record is."""
         return self.record.status
 
     @property
     def reason(self) -> str:
-        """Why it has that status."""
+        """Reason for the status."""
         return self.record.reason
 
     @property
     def reason_texts(self) -> tuple[str, ...]:
-        """Texts of the reasons, the most serious first; empty where their codes are absent or of another version."""
+        """Texts of the reasons, the most serious first; empty if their codes are absent or of another version."""
         try:
             return tuple(text_of(reason.code, reason.data) for reason in self.record.reasons)
         except (KeyError, TypeError, ValueError, OverflowError):
@@ -171,7 +171,7 @@ class SavedFit:
         return bool(self.entry.stages or self.entry.fitted) and self.fitted
 
     def summary_mm(self, stage: str, direction: Direction, measure: Measure) -> float:
-        """Return a distance over the whole model, or the whole scan, in mm; NaN if there is none."""
+        """Return a distance over the entire model, or the entire scan, in mm; NaN if there is none."""
         summary = self.record.distances_mm.get(stage)
         return known(getattr(getattr(summary, direction), measure)) if summary else math.nan
 
@@ -187,7 +187,7 @@ class SavedFit:
         return float(value) if isinstance(value, int | float) else math.nan
 
     def with_entry(self, **values: Any) -> SavedFit:
-        """Return the fit with more known beside its record, by the names of `FitEntry`."""
+        """Return the fit with further metadata, by the names of `FitEntry`."""
         return SavedFit(structs.replace(self.entry, **values), self.record)
 
     def numbers(self, key: Literal["b", "z"]) -> FloatArray:
@@ -198,7 +198,7 @@ class SavedFit:
         """
         values = np.array(getattr(self.record, key), dtype=np.float64)
         if not len(values) or len(values) != len(self.record.b):
-            raise FileFormatError(f"The record of {self.name} holds no list of numbers {key!r}; {_AGAIN}.")
+            raise FileFormatError(f"The record of {self.name} contains no list of numbers {key!r}; {_AGAIN}.")
         return values
 
 
@@ -224,7 +224,7 @@ def has_fits(folder: Folder) -> bool:
 def find_fits(folder: Folder) -> list[SavedFit]:
     """Return the fits whose records lie directly in `folder`, in the order of their names.
 
-    One that cannot be read has the status `unreadable` and says why.
+    A fit that cannot be read has the status `unreadable` and the reason.
 
     Raises:
         FileError: the folder cannot be read.
@@ -232,7 +232,7 @@ def find_fits(folder: Folder) -> list[SavedFit]:
     """
     results = _results(folder)
     if not results:
-        raise InputError(f"{folder.root} holds no fits (NAME{ENDING}); give a folder that shapespace fit wrote.")
+        raise InputError(f"{folder.root} contains no fits (NAME{ENDING}); give a folder that shapespace fit wrote.")
     return [saved_fit(folder, results, name) for name in results.names()]
 
 
@@ -293,7 +293,7 @@ def _in_picture_frame(mesh: Mesh, fit: SavedFit) -> Mesh:
     T, mm = fit.record.T_scan_model, fit.record.mm_per_scan_unit
     if T is None or not T.scale > 0 or mm is None or not mm > 0:
         raise FileFormatError(f"The record of {fit.name} has no pose T_scan_model or no mm_per_scan_unit; {_AGAIN}.")
-    with np.errstate(all="ignore"):  # what overflows is refused
+    with np.errstate(all="ignore"):  # overflow is rejected below
         vertices = mm * ((mesh.vertices - np.array(T.translation)) @ np.array(T.rotation))
     if not (len(vertices) and np.isfinite(vertices).all()):
         raise FileFormatError(f"{fit.name}: its surface, its scan or its pose has no finite coordinates; {_AGAIN}.")
@@ -305,7 +305,7 @@ def raw_scan(folder: Folder, fit: SavedFit) -> Mesh:
 
     Raises:
         FileError: it cannot be read.
-        ScanNotFoundError: it is not, or is no scan.
+        ScanNotFoundError: the file was moved or changed, or is no scan.
     """
     mesh = unchanged_scan(folder.root, fit.record.scan.path, fit.record.scan.hash)
     if len(mesh.vertices) < _FEWEST_POINTS:
@@ -317,10 +317,10 @@ def unchanged_scan(root: Path, path: str, sha256: str) -> Mesh:
     """Return a scan from its file, if the file is still at `path`, relative to `root`, with the same content.
 
     Raises:
-        ScanNotFoundError: it is not, or cannot be read.
+        ScanNotFoundError: the file was moved or changed, or cannot be read.
     """
     if not path or "\0" in path:
-        raise ScanNotFoundError("the record does not say where the scan is.")
+        raise ScanNotFoundError("the record does not contain the path of the scan.")
     if not (root / path).is_file() or sha256_of_file(root / path) != sha256:
         raise ScanNotFoundError("the scan is no longer where it was, or has changed.")
     try:
@@ -333,14 +333,14 @@ def model_of(folder: Folder, fits: Sequence[SavedFit], model_path: Path | None =
     """Return the model that `fits` were made with.
 
     Args:
-        folder: where the fits lie.
+        folder: folder of the fits.
         fits: one or more; those without a readable record do not count.
-        model_path: the model's file; None goes by the path in the records.
+        model_path: file of the model; None for the path in the records.
 
     Raises:
         FileError: it cannot be read.
         FileFormatError: it is damaged.
-        InputError: it is not where the records say, or not the one they name.
+        InputError: the model is not at the path in the records, or is not the model that they name.
     """
     sources = [fit.record.model for fit in fits if fit.record.model.hash]
     hashes = {source.hash for source in sources}
@@ -375,7 +375,7 @@ _OPTIONS = {
 }  # fmt: skip
 """Setting in a record -> its option."""
 _SETTINGS = ("max_iterations", "seed", "landmark_stddev_mm")
-"""Those that are given by --set."""
+"""Settings that are passed with --set."""
 
 
 def command_with_stages(root: Path, records: Mapping[str, FitRecord]) -> str:
@@ -390,7 +390,7 @@ def command_with_stages(root: Path, records: Mapping[str, FitRecord]) -> str:
     """
     first = next(iter(records.values()))
     scans = [record.scan.path or "SCAN" for record in records.values()]
-    if not (len(records) == 1 and first.landmarks is None and not first.metadata) and _listed(
+    if not (len(records) == 1 and first.landmarks is None and not first.metadata) and _listed_names(
         root / FitRecord.LIST
     ) == set(records):
         scans = [FitRecord.LIST]
@@ -406,7 +406,7 @@ def command_with_stages(root: Path, records: Mapping[str, FitRecord]) -> str:
     return shlex.join(["shapespace", "fit", first.model.path or "MODEL.h5", *scans, "-o", ".", "--stages", *options])
 
 
-def _listed(file: Path) -> set[str]:
+def _listed_names(file: Path) -> set[str]:
     """Return the names of the results in a list of scans; none if there is no such list."""
     try:
         rows = table_rows(read_bytes(file))
@@ -422,10 +422,10 @@ class Moment:
 
     Args:
         phase: 1 or 2.
-        iteration: from 0, by phase.
+        iteration: number of the iteration in its phase, from 0.
         rms_mm: RMS closest distance, mm of the scan.
-        b: (K,) coefficients then, mm of the model's frame.
-        T_final_now: from the model's frame then to the picture frame, see `stage_arrays`.
+        b: (K,) coefficients in this iteration, mm of the model's frame.
+        T_final_now: transformation from the model's frame in this iteration to the picture frame, see `stage_arrays`.
     """
 
     phase: int
@@ -435,7 +435,7 @@ class Moment:
     T_final_now: Similarity
 
     def vertices(self, model: ShapeModel) -> FloatArray:
-        """Return the model's surface then, (V, 3), in the picture frame."""
+        """Return the model's surface in this iteration, (V, 3), in the picture frame."""
         return self.T_final_now.apply(model.reconstruct(self.b))
 
 
@@ -444,22 +444,22 @@ class StagedFit:
     """A fit in the picture frame: the axes of the model's frame, and the size of the scan in mm.
 
     Args:
-        name: of the fit.
-        label: what pictures call it.
+        name: name of the fit.
+        label: label in pictures.
         status: `converged`, `max_iterations` or `doubtful`.
-        reason: one sentence on why.
+        reason: one sentence on the reason for the status.
         scan: the raw surface or points, as repaired.
-        surfaces: the model at each stage: `final`; `before` and `initial` where the stages were saved; `dense` where
-            there was one.
-        model_to_scan_mm: by stage, (V,) signed closest distances: positive where the scan lies outside of the model;
-            not-a-number at vertices that the scan does not show, as in `OverlapDistances`.
-        scan_to_model_mm: by stage, (S,) the same of scan points; not-a-number beyond the model's rim.
-        regions: (V,) codes of `fit.regions.REGIONS`; None where the stages were not saved.
+        surfaces: the model at each stage: `final`; `before` and `initial` if the stages were saved; `dense` if
+            there is a dense stage.
+        model_to_scan_mm: (V,) signed closest distances by stage: positive where the scan lies outside of the model;
+            NaN at vertices that the scan does not show, as in `OverlapDistances`.
+        scan_to_model_mm: (S,) signed closest distances of scan points by stage; NaN beyond the model's rim.
+        regions: (V,) codes of `fit.regions.REGIONS`; None if the stages were not saved.
         b: (K,) mm.
         z: (K,) in standard deviations of the model.
         b_stddev: (K,) mm.
         shrinkage: (K,) in [0, 1].
-        history: the iterations, in order; empty where the stages were not saved.
+        history: the iterations, in order; empty if the stages were not saved.
     """
 
     name: str
@@ -479,12 +479,12 @@ class StagedFit:
 
     @cached_property
     def scale_mm(self) -> float:
-        """Where the colour scale of the signed distances ends, in every picture of this fit."""
+        """End of the colour scale of signed distances in all pictures of this fit, mm."""
         return scale_end(np.concatenate([self.model_to_scan_mm["final"], self.scan_to_model_mm["final"]]))
 
     @property
     def region_shares(self) -> dict[str, float]:
-        """Share of the vertices in each of `REGIONS`; empty where the stages were not saved."""
+        """Share of the vertices in each of `REGIONS`; empty if the stages were not saved."""
         if self.regions is None:
             return {}
         shares = np.bincount(self.regions, minlength=len(REGIONS)) / max(len(self.regions), 1)
@@ -503,15 +503,15 @@ class StagedFit:
     ) -> StagedFit:
         """Return a fit from its saved surfaces and its scan, and measure its distances.
 
-        A vertex counts as not shown by the scan where its closest point lies on the border of the scan; nowhere if the
+        A vertex counts as not shown by the scan if its closest point lies on the border of the scan; nowhere if the
         record states that the scan shows the complete model.
 
         Args:
-            surfaces: `final`, and `dense` where there is one, in the picture frame.
-            scan: as repaired, in the picture frame.
-            record: of the fit.
-            name: of the fit.
-            label: what pictures call it.
+            surfaces: `final`, and `dense` if there is one, in the picture frame.
+            scan: scan as repaired, in the picture frame.
+            record: record of the fit.
+            name: name of the fit.
+            label: label in pictures.
 
         Raises:
             FileFormatError: the numbers of the record do not fit together.
@@ -545,17 +545,17 @@ class StagedFit:
         )
 
     @staticmethod
-    @np.errstate(all="ignore")  # what overflows, or is divided by zero, is refused at the end
+    @np.errstate(all="ignore")  # overflow and division by zero are rejected at the end
     def from_arrays(
         arrays: Mapping[str, npt.NDArray[Any]], record: FitResult | FitRecord, *, name: str, label: str
     ) -> StagedFit:
         """Return a fit from the arrays of NAME.stages.npz.
 
         Args:
-            arrays: of the file.
-            record: its result, or its record: status, reason and numbers.
-            name: of the fit.
-            label: what pictures call it.
+            arrays: arrays of the file.
+            record: result or record of the fit, with its status, reason and coefficients.
+            name: name of the fit.
+            label: label in pictures.
 
         Raises:
             FileFormatError: arrays are absent, of an earlier version, or do not fit together.
@@ -633,7 +633,7 @@ def mean_mm(distances_mm: FloatArray) -> float:
 
 
 _MEDIANS = 5.0
-"""Of the distances, at which a scale ends at the latest; beyond it lies what is no part of the object."""
+"""Upper limit of a scale, in medians of the distances; larger distances are not those of the object."""
 
 
 def scale_end(distances_mm: FloatArray) -> float:
@@ -645,7 +645,7 @@ def scale_end(distances_mm: FloatArray) -> float:
 
 
 def nice_ceiling(value: float) -> float:
-    """Return a round number at or a little above `value`, 1 where that is not positive."""
+    """Return a round number at or a little above `value`, 1 if that is not positive."""
     if not (value > 0 and np.isfinite(value)):
         return 1.0
     power = 10.0 ** np.floor(np.log10(value))

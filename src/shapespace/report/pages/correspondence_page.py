@@ -84,21 +84,21 @@ _Make: TypeAlias = Callable[[CorrespondRecord], Cell]
 
 
 class CorrespondencePage:
-    """The report of a correspondence in the making.
+    """Builder of the report of a correspondence.
 
     Args:
-        folder: that `shapespace correspond` wrote.
+        folder: folder that `shapespace correspond` wrote.
         page: page that it fills.
 
     Raises:
         FileError: correspondence.json or the mean shape cannot be read.
-        FileFormatError: one of them is damaged, or no scan's record can be read.
+        FileFormatError: correspondence.json or the mean shape is damaged, or no scan's record can be read.
     """
 
     def __init__(self, folder: Folder, page: Page) -> None:
         self.result = Corresponded(folder.root)
         if not self.result.records:
-            raise FileFormatError(f"{folder.root} holds no record of a scan; {CORRESPOND_AGAIN}.")
+            raise FileFormatError(f"{folder.root} contains no record of a scan; {CORRESPOND_AGAIN}.")
         self.page = page
         page.planned = len(self.result.corresponding) + min(len(self.result.records), MOST_CARDS) + 5
         self.all = self.result.population(self.page.step)
@@ -108,7 +108,7 @@ class CorrespondencePage:
         self.concerns = concerns_of(self.result)
         self.ordered = sorted(self.records, key=lambda record: (-self.concerns[record.name].weight, record.name))
         self.out = [*self.result.set_aside, *(self.result.records[name] for name in self.all.unread)]
-        self._cards = {record.name: self.page.anchor(f"scan-{record.name}") for record in self._carded()}
+        self._cards = {record.name: self.page.anchor(f"scan-{record.name}") for record in self._select_cards()}
 
     # Facts of each
 
@@ -117,13 +117,13 @@ class CorrespondencePage:
         return distance_share(record, which, self.size.get(record.name, nan))
 
     def status(self, record: CorrespondRecord) -> Cell:
-        """Return what came of a scan, sorted from bad to good."""
+        """Return the status of a scan, sorted from bad to good."""
         kind = scan_status(record, self.concerns)
         return Cell(_STATUS[kind][0], float(list(_STATUS).index(kind)), _STATUS[kind][1])
 
     @property
     def looked_at(self) -> list[CorrespondRecord]:
-        """The scans that stand out."""
+        """Scans that need review."""
         return [record for record in self.ordered if self.concerns[record.name].reasons]
 
     # The page
@@ -134,7 +134,7 @@ class CorrespondencePage:
         chapters = [
             Chapter("Summary", self.summary),
             Chapter("The same places on every scan", self.same_places, "Same places"),
-            Chapter("How near, and where nothing is shown", self.nearness, "Nearness"),
+            Chapter("Distances and missing vertices", self.nearness, "Nearness"),
             Chapter("The scans", self.scans, "Scans"),
             Chapter("The rounds", self.rounds, "Rounds"),
             Chapter("Settings and hashes", self.settings, "Settings"),
@@ -145,7 +145,7 @@ class CorrespondencePage:
             f"Correspondence of {counted(self.total, 'scan')} in {name}",
             [
                 Text(
-                    "Raw scans brought to one surface: the same vertex is meant to be the same place on all of them. "
+                    "Raw scans in correspondence: the same vertex is meant to be the same place on all scans. "
                     "The size of an object is the RMS distance of its surface from its middle."
                 )
             ],
@@ -155,11 +155,11 @@ class CorrespondencePage:
 
     @property
     def total(self) -> int:
-        """How many scans there are, unreadable ones too."""
+        """Number of scans, including unreadable scans."""
         return len(self.result.records) + len(self.result.unread)
 
     def summary(self) -> list[Block]:
-        """Return what came of the scans, in a sentence, in figures, and those that need a look."""
+        """Return the result of the correspondence in sentences and figures, and the scans that need review."""
         mean, far = (median([self.share(r, which) for r in self.records]) for which in ("mean", "p99"))
         tiles = [
             (str(len(self.records)), f"of {self.total}", "scans in correspondence"),
@@ -206,7 +206,7 @@ class CorrespondencePage:
         ]
 
     def verdict(self) -> str:
-        """Return in a few sentences whether to go on, and what to look at first."""
+        """Return a few sentences on the state of the correspondence and on the scans to review."""
         n, aside = len(self.records), len(self.out) + len(self.result.unread)
         some = self.looked_at
         excluded = f"; {aside} {'is' if aside == 1 else 'are'} excluded"
@@ -239,7 +239,7 @@ class CorrespondencePage:
             return f"The rounds have settled: in the last one vertices moved by {percent_of(moved[-1])} of the size."
         return (
             f"The rounds have not settled: in the last one vertices still moved by {percent_of(moved[-1])} of the "
-            f"size, and {percent_of(self.result.settled)} counts as settled; more --rounds may still better it."
+            f"size, and {percent_of(self.result.settled)} counts as settled; more --rounds may still improve it."
         )
 
     def _items(self, texts: Mapping[str, str]) -> list[str | Text]:
@@ -259,7 +259,7 @@ class CorrespondencePage:
             return [Text("There is no surface to show.", "broken")]
         placed = {record.name: self.result.placed(record.name) for record in pictured}
         which = "All scans." if len(pictured) == len(self.records) else (
-            f"{len(pictured)} of {counted(len(self.records), 'scan')}: those that stand out most, then some of the "
+            f"{len(pictured)} of {counted(len(self.records), 'scan')}: those that need review most, then some of the "
             "others."
         )  # fmt: skip
         surfaces, labels = [placed[r.name].vertices for r in pictured], [record.name for record in pictured]
@@ -268,7 +268,7 @@ class CorrespondencePage:
             drawn = figures.checkerboard_figure(
                 self.mean, surfaces, labels, yaw_deg=yaw, title=f"The same squares on every scan, {side}"
             )
-            # As wide as the page: small squares tell nothing.
+            # As wide as the page, since small squares cannot be compared.
             pictures.append(
                 replace(
                     self.page.figure(
@@ -284,13 +284,13 @@ class CorrespondencePage:
                 "Compare them place by place: an edge or a corner that you know, such as the corner of an eye or a "
                 "knob of a bone, must lie in the same square on every scan, at the same place of the square. "
                 "Where squares have slid along the surface, the correspondence is wrong, however near the surface lies "
-                "to the scan. All are turned and sized as the mean shape; what a scan does not show is left out."
+                "to the scan. All have the pose and size of the mean shape; parts that a scan lacks are omitted."
             ),
             *pictures,
         ]
 
     def _boards(self) -> list[CorrespondRecord]:
-        """Return the scans of the checkerboards: those that stand out, and some evenly from the others."""
+        """Return the scans of the checkerboards: those that need review, and some evenly from the others."""
         first = self.looked_at[: MOST_BOARDS // 2 + 1] if len(self.records) > MOST_BOARDS else list(self.ordered)
         rest = [record for record in self.ordered if record not in first]
         room = MOST_BOARDS - len(first)
@@ -303,22 +303,22 @@ class CorrespondencePage:
         shares = np.array([[self.share(r, w) for w in ("mean", "p95", "p99", "max")] for r in self.records])
         share = 1 - self.all.seen_count / len(self.records)
         hardly = float((share > 1 - _HARDLY_SEEN).mean())
-        most = f"{percent(hardly)} on more than half, which build leaves out" if hardly else "none on more than half"
+        most = f"{percent(hardly)} on more than half, which build omits" if hardly else "none on more than half"
         missing = f"{percent(float((share > 0).mean()))} of the vertices are missing on at least one scan, and {most}."
         there = median([known(record.area_share) for record in self.records])
         lacking = (
             f"The mean shape lacks parts that the scans show: its surface is {percent(there)} of the median scan's, "
-            "mostly because the first template lacked them. Give a whole one with --template."
+            "mostly because the first template lacked them. Pass a complete template with --template."
         )
         holes = (
-            f"The mean shape has {counted(self.result.holes, 'hole')} beside its border. Where the object has no "
-            "opening, the first template had a hole, and no scan can show anything there; give a whole one with "
-            "--template."
+            f"The mean shape has {counted(self.result.holes, 'hole')} in addition to its border. If the object has no "
+            "opening there, the first template had a hole, and no scan can show anything there; pass a complete "
+            "template with --template."
         )
         return [
             Text(
                 "Distances are measured both ways: from the vertices that a scan shows to the scan, and from its "
-                "points to the surface, leaving out what lies beyond the surface's rim."
+                "points to the surface, excluding the points beyond the surface's rim."
             ),
             Text(lacking if there < _WHOLE_SHARE else "", "notice"),
             Text(holes if self.result.holes else "", "notice"),
@@ -339,7 +339,7 @@ class CorrespondencePage:
         ]
 
     def _confidence(self) -> list[Block]:
-        """Return how sure the position of each vertex along the surface is; nothing for surfaces of older versions."""
+        """Return the uncertainty of vertex positions along the surface; nothing for surfaces of older versions."""
         std = self.all.position_std
         if std is None:
             return []
@@ -374,7 +374,7 @@ class CorrespondencePage:
             self.page.section("Every scan in numbers", self.numbers),
         ]
 
-    def _carded(self) -> list[CorrespondRecord]:
+    def _select_cards(self) -> list[CorrespondRecord]:
         first = self.out[: max(MOST_EMPTY_CARDS, MOST_CARDS - len(self.records))]
         return [*first, *self.ordered[: MOST_CARDS - len(first)]]
 
@@ -384,8 +384,8 @@ class CorrespondencePage:
         limit = nice_ceiling(limit)
         key = StripKey(
             "Each strip, from the left: the scan; the checkerboard of the front view; how far each vertex lies from "
-            "the scan (pale to dark); how much each triangle has shrunk (blue) or grown (red) beside the mean shape, "
-            "with the change of size divided out and folded triangles in black.",
+            "the scan (pale to dark); how much each triangle has shrunk (blue) or grown (red) relative to the mean "
+            "shape, with the change of size divided out and folded triangles in black.",
             [
                 (self.page.image(thumbnails.colour_bar(c), f"from {low} to {high}"), low, high)
                 for c, low, high in [
@@ -395,9 +395,9 @@ class CorrespondencePage:
             ],
             "Where areas change, shapes may differ; where they change suddenly, squares have slid.",
         )
-        carded = self._carded()
+        carded = self._select_cards()
         return [
-            Text("Sorted: excluded scans first, then by how much they stand out."),
+            Text("Sorted: excluded scans first, then by their need for review."),
             no_picture(len(self.records) + len(self.out) - len(carded), "scan"),
             key,
             Gallery([self.card(record, limit) for record in carded]),
@@ -427,7 +427,7 @@ class CorrespondencePage:
         return Card(self._cards[record.name], record.name, status, "", text, image)
 
     def _still(self, record: CorrespondRecord, limit: float) -> tuple[Image, str]:
-        """Return the picture of a scan, and what it lacks."""
+        """Return the picture of a scan, and a sentence on a missing scan."""
         if record in self.out:
             scan = drawable(self._bounded(record))[0]
             if scan.faces is not None:
@@ -439,7 +439,7 @@ class CorrespondencePage:
         try:
             scan, far = self._scan_on_mean(drawable(self._bounded(record))[0], placed)
         except FileFormatError as error:
-            note = f"Without the scan beside it: {error}"
+            note = f"The picture lacks the scan: {error}"
         still = thumbnails.correspondence_strip(self.mean, placed.vertices, scan, far, limit)
         seen = "the scan, the checkerboard, distances and areas" if scan else "the checkerboard and areas"
         return self.page.image(still, f"{record.name}: {seen}"), note
@@ -448,7 +448,7 @@ class CorrespondencePage:
         return decimate(self.result.raw_scan(record), _TRIANGLES_DRAWN)[0]
 
     def _scan_on_mean(self, scan: Mesh, placed: PlacedSurface) -> tuple[Mesh, FloatArray]:
-        """Return the scan moved onto the mean shape, and how far off each vertex lies, percent of the size."""
+        """Return the scan moved onto the mean shape, and the distance of each vertex from it, percent of the size."""
         moved = scan.with_vertices(placed.T_scan_mean.inverse().apply(scan.vertices))
         far = np.full(len(placed.vertices), nan)
         far[placed.seen] = build_engine(moved).query(placed.vertices[placed.seen]).distance
@@ -470,7 +470,7 @@ class CorrespondencePage:
             (Column("Area covered, %", "number"), lambda r: number(100 * known(r.area_share), 1)),
             (Column("Folded, %", "number"), lambda r: _cell(100 * known(r.folded_share))),
             (Column("Area change, times", "number"), lambda r: number(known(r.area_factor), 2)),
-            (Column("Size beside the usual", "number"), lambda r: number(known(r.scale), 3)),
+            (Column("Size, relative to usual", "number"), lambda r: number(known(r.scale), 3)),
             (Column("Moved last, % of size", "number"), lambda r: _cell(100 * (r.moved_share or [nan])[-1])),
             (Column("CPU seconds", "number"), lambda r: number(sum(r.cpu_s) if r.cpu_s else nan, 1)),
         ]
@@ -479,8 +479,9 @@ class CorrespondencePage:
         first = f"The first {MOST_ROWS:,} of {len(records):,} scans; their records have all."
         caption = (
             "Distances are both ways; those without % are in the unit of the scan's file. Area covered: that of the "
-            "surface beside that of the scan. Folded: triangles that turn back over their neighbours. Area change: "
-            "95 % of the triangles grow or shrink by less than so many times beside the mean shape, size divided out."
+            "surface relative to that of the scan. Folded: triangles that turn back over their neighbours. Area "
+            "change: 95 % of the triangles grow or shrink by less than this factor relative to the mean shape, size "
+            "divided out."
         )
         why = [[record.name, self._reason(record)] for record in records if self._reason(record)]
         return [
@@ -502,12 +503,12 @@ class CorrespondencePage:
     # The rest
 
     def rounds(self) -> list[Block]:
-        """Return by how much vertices moved in each round, and what it cost."""
+        """Return the movement of vertices in each round, and the computing time."""
         run = self.result.run
         figure = self.page.figure(
             figures.movement_figure(run.rounds, [record.moved_share for record in self.records], self.result.settled),
-            "Each round begins at what the last one found. The first counts from the first template, so it is the "
-            "largest; when vertices move no more, another round changes nothing.",
+            "Each round starts from the result of the previous round. The first movement is measured from the first "
+            "template, so it is the largest; when vertices no longer move, another round changes nothing.",
             alt=f"Movement of vertices in {counted(len(run.rounds), 'round')}: "
             + listed([percent_of(moved) for moved in run.rounds]),
             chart=True,
@@ -546,7 +547,7 @@ class CorrespondencePage:
         ]
 
     def quality(self) -> list[Block]:
-        """Return what quality.json says."""
+        """Return the figure of quality.json."""
         return [
             sections.quality_part(
                 self.page, read(Quality, self.result.folder.json("quality.json"), "quality.json", "measure it again")

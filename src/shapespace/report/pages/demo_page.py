@@ -1,4 +1,4 @@
-"""The report of the demo: both experiments of the paper, beside what the paper states."""
+"""The report of the demo: both experiments of the paper, compared with the values in the paper."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ _NOTHING = Text("No fit kept its surfaces.", "broken")
 
 
 class DemoPage:
-    """The report of the demo.
+    """Builder of the report of the demo.
 
     Args:
-        folder: of the demo.
+        folder: folder of the demo.
         page: page that it fills.
 
     Raises:
@@ -110,7 +110,7 @@ class DemoPage:
         """Return the key numbers, the main figure, and the comparison with the paper."""
         return [
             *self.tiles(),
-            *self.with_headings({"Main figure": self.main_figure, "The paper beside this run": self.paper_table}),
+            *self.with_headings({"Main figure": self.main_figure, "Comparison with the paper": self.paper_table}),
         ]
 
     def tiles(self) -> list[Block]:
@@ -122,15 +122,15 @@ class DemoPage:
         distances = [fit.distance_mm("model_to_scan") for fit in fits if fit.entry in tests]
         errors = _mean([entry.vertex_error_mm.mean for entry in tests if entry.vertex_error_mm])
         floors = _mean([entry.floor_mm.mean for entry in tests if entry.floor_mm])
-        blind = "fits converged with nothing found against them; the plain method is blind to some errors"
+        blind = "fits converged with no problems detected; the plain method misses some errors"
         tiles = [
             (str(counts["converged"]), f"of {total}", blind),
             (
                 plain(self.demo.experiment1.modes_for_98_5),
                 "",
-                "modes hold 98.5 % of the variance of one person's expressions",
+                "modes contain 98.5 % of the variance of one person's expressions",
             ),
-            (*_number_and_unit(_mean(distances)), "mean closest distance, test faces to scans, over what these show"),
+            (*_number_and_unit(_mean(distances)), "mean closest distance, test faces to scans, where observed"),
             (*_number_and_unit(errors), f"their true vertex error; the model's best possible is {mm(floors)}"),
         ]
         rest = ", ".join(
@@ -144,7 +144,7 @@ class DemoPage:
             Text(text),
             Tiles(tiles),
             Notice(
-                "Not to be trusted without a look",
+                "Needs review",
                 [f"{fit.name}: {STATUS_WORDS[fit.status]}. {fit.reason}" for fit in fits if fit.status != "converged"],
             ),
             Notice("Cannot be read", problems),
@@ -194,48 +194,49 @@ class DemoPage:
         """Return the values of the paper and the values that this run measured."""
         claims = self.demo.paper_table
         if not claims:
-            raise FileFormatError("demo.json holds no comparison with the paper; run the demo again.")
+            raise FileFormatError("demo.json contains no comparison with the paper; run the demo again.")
         return text_table(
             ("Quantity", "Paper", "This run", "True error", "Why it differs"),
             [[row.quantity, row.paper, row.measured, row.truth or DASH, row.why or "It does not."] for row in claims],
             "Distances are to the closest point of the scan; the true error is between vertices that correspond, "
-            "beside the floor that a perfect fit of the same model would reach.",
+            "compared with the floor that a perfect fit of the same model would reach.",
         )
 
     # Experiment 1
 
     def experiment_1(self) -> list[Block]:
         """Return one person's expressions: model, fits, recognition."""
-        one = self.demo.experiment1
-        if not one.model:
-            raise FileFormatError("demo.json holds no experiment 1; run the demo again.")
-        fits, problems = self.readable(one.fits)
+        experiment = self.demo.experiment1
+        if not experiment.model:
+            raise FileFormatError("demo.json contains no experiment 1; run the demo again.")
+        fits, problems = self.readable(experiment.fits)
         tests = _tests(fits)
         farthest = sorted(
             (fit for fit in tests if fit.pictured),
             key=lambda fit: -np.nan_to_num(fit.summary_mm("before", "model_to_scan", "max")),
         )
         intro = (
-            f"{one.title or 'Expressions of one person'}: {_count(one.n_training)} faces of one simulated person make "
-            f"the model, {_count(one.modes_for_98_5)} modes hold 98.5 % of their variance, and unseen expressions are "
-            "fitted as raw surfaces: triangulated anew, moved, turned, scaled, with 0.2 mm noise."
+            f"{experiment.title or 'Expressions of one person'}: {_count(experiment.n_training)} faces of one "
+            f"simulated person make the model, {_count(experiment.modes_for_98_5)} modes contain 98.5 % of their "
+            "variance, and unseen expressions are fitted as raw surfaces: with other triangles, moved, turned, "
+            "scaled, with 0.2 mm noise."
         )
         parts: dict[str, Make] = {
-            "The training faces": lambda: self.training(one),
-            "Mean and first modes": lambda: self.modes(one, "Paper, figures 2 and 3. "),
+            "The training faces": lambda: self.training(experiment),
+            "Mean and first modes": lambda: self.modes(experiment, "Paper, figures 2 and 3. "),
             "The test faces": lambda: self.test_faces(tests),
             "From far away, step by step": lambda: (
                 [
                     block
                     for fit in farthest[: 1 if self.demo.quick else 2]
-                    for block in self.one_fit(fit, fit.label, one.population_z)
+                    for block in self.one_fit(fit, fit.label, experiment.population_z)
                 ]
                 or [_NOTHING]
             ),
             "Test faces, fitted": lambda: self.all_fitted(tests),
             "Distance maps": lambda: self.maps(tests),
             "Every fit in numbers": lambda: self.numbers(fits),
-            "Expressions as directions": lambda: self.directions(one, fits),
+            "Expressions as directions": lambda: self.directions(experiment, fits),
         }
         return [Text(intro), Notice("Cannot be read", problems), *self.with_headings(parts)]
 
@@ -243,15 +244,15 @@ class DemoPage:
         """Return the table of fits."""
         return sections.fits_table(fits, {}, caption="Distances at the end, in mm. A dash: not known.")
 
-    def training(self, one: ExpressionsOfOne) -> Figure:
+    def training(self, experiment: ExpressionsOfOne) -> Figure:
         """Return some of the training faces."""
-        examples = one.training_examples[: 8 if self.demo.quick else 12]
+        examples = experiment.training_examples[: 8 if self.demo.quick else 12]
         meshes = [self.folder.mesh(example.file) for example in examples]
         return self.page.figure(
             figures.faces_grid(
                 meshes, [example.label for example in examples], title="Training faces: one person, mixed expressions"
             ),
-            f"Paper, figure 1. {len(meshes)} of the {_count(one.n_training)} faces that the model is made of.",
+            f"Paper, figure 1. {len(meshes)} of the {_count(experiment.n_training)} faces that the model is made of.",
             alt=f"{len(meshes)} faces of one person with different expressions, in a grid",
         )
 
@@ -279,7 +280,7 @@ class DemoPage:
         ]
 
     def one_fit(self, fit: SavedFit, label: str, population_z: Sequence[Sequence[float]] = ()) -> list[Block]:
-        """Return one fit with all its pictures, and its coefficients beside those of the population (N, K)."""
+        """Return one fit with all its pictures, and its coefficients compared with those of the population (N, K)."""
         if len({len(z) for z in population_z}) > 1:
             raise FileFormatError("population_z in demo.json has rows of different lengths; run the demo again.")
         return sections.fit_in_full(
@@ -306,9 +307,9 @@ class DemoPage:
             absent,
         ]
 
-    def directions(self, one: ExpressionsOfOne, fits: Sequence[SavedFit]) -> list[Block]:
+    def directions(self, experiment: ExpressionsOfOne, fits: Sequence[SavedFit]) -> list[Block]:
         """Return the coefficients of the test faces, and the scores of recognition."""
-        left_out = plain(one.scores.get("left_out")).split(", ")
+        left_out = plain(experiment.scores.get("left_out")).split(", ")
         usable = [fit for fit in fits if fit.status != "failed" and fit.name not in left_out]
         scans = [sections.coefficients_of(fit) for fit in _tests(usable)]
         neutral = next((sections.coefficients_of(fit) for fit in usable if not fit.entry.intensity), None)
@@ -322,7 +323,7 @@ class DemoPage:
             if all(len(scan.b) >= 3 for scan in scans):
                 out += self.page.tried(lambda: sections.scatter_to_turn(self.page, scans))
         return out + sections.score_tables(
-            one.scores, many="Is each expression a line through neutral?", single="Are the expressions disjoint?"
+            experiment.scores, many="Is each expression a line through neutral?", single="Are the expressions disjoint?"
         )
 
     def maps(self, tests: Sequence[SavedFit]) -> list[Block]:
@@ -355,7 +356,7 @@ class DemoPage:
     def experiment_2(self) -> list[Block]:
         """Return models of many people, fitted to scans of another person."""
         if not self.cases:
-            raise FileFormatError("demo.json holds no case of experiment 2; run the demo again.")
+            raise FileFormatError("demo.json contains no case of experiment 2; run the demo again.")
         scans = "a scan" if len(self.cases) == 1 else "scans"
         models = [case.model for case in self.cases]
         return [
@@ -375,9 +376,9 @@ class DemoPage:
         kind = "Simulated scan. " if case.simulated else "Real scan. "
         kind = "" if case.note.lower().startswith(("simulated", "real", "a real")) else kind
         used = f", and {case.n_modes} are used" if case.n_modes else ""
-        modes = f"its {_count(case.n_modes)} modes hold less than 98.5 % of the variance."
+        modes = f"its {_count(case.n_modes)} modes contain less than 98.5 % of the variance."
         if case.modes_for_98_5:
-            modes = f"{case.modes_for_98_5} modes hold 98.5 % of the variance{used}."
+            modes = f"{case.modes_for_98_5} modes contain 98.5 % of the variance{used}."
         out: list[Block] = [
             Text(kind + case.note, "notice" if case.simulated else ""),
             Text(f"The model is made of {_count(case.n_training)} people; {modes}"),
@@ -442,7 +443,7 @@ def _strongest(pictured: Sequence[tuple[SavedFit, StagedFit]]) -> list[StagedFit
 
 
 def _short(case: Case) -> str:
-    """Return the name of a case that fits beside a row of pictures."""
+    """Return a short name of a case, for the heading of a row of pictures."""
     return case.short or case.fit.name
 
 

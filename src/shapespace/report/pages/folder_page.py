@@ -89,14 +89,14 @@ _RESERVE_BYTES, _MOST_RESERVED = 400_000, 2
 
 
 class FolderPage:
-    """The report of a folder of fits in the making.
+    """Builder of the report of a folder of fits.
 
     Args:
-        folder: that the fits lie in.
-        fits: found there, one or more.
+        folder: folder of the fits.
+        fits: fits of the folder, one or more.
         page: page that it fills.
-        model: the model's file, or None to go by the records.
-        labels: a table of labels, or None to look for one.
+        model: file of the model; None for the path in the records.
+        labels: table of labels; None to look for one.
     """
 
     def __init__(
@@ -127,25 +127,25 @@ class FolderPage:
         if model is not None:
             self.model()
         self._details = {fit.name: self.page.anchor(f"pictures-of-{fit.name}") for fit in self.main}
-        carded = _carded(self.fits) if len(fits) > 1 or not self.main else []
+        carded = _select_cards(self.fits) if len(fits) > 1 or not self.main else []
         self._cards = {fit.name: self.page.anchor(f"fit-{fit.name}") for fit in carded}
         self.carded = carded
 
-    # What is read, once
+    # Cached input
 
     def model(self) -> ShapeModel:
         """Return the model of the fits."""
         return self.page.once("model", lambda: model_of(self.folder, self.fits, self.model_path))
 
     def staged(self, fit: SavedFit) -> StagedFit:
-        """Return what pictures of `fit` need, called by its name."""
+        """Return the data for pictures of `fit`, labelled with its name."""
         return self.page.once(fit, lambda: replace(staged_fit(self.folder, fit), label=fit.name))
 
     # The page
 
     def html(self) -> str:
         """Return the page."""
-        lead = "What a statistical shape model made of raw surfaces. Lengths are in millimetres of the scan."
+        lead = "Fits of a statistical shape model to raw surfaces. Lengths are in millimetres of the scan."
         name = self.folder.root.resolve().name
         return self.page.html(
             f"{counted(self.total, 'fit')} in {name}",
@@ -177,33 +177,33 @@ class FolderPage:
 
     @property
     def places(self) -> Mapping[str, str]:
-        """Where in the page a fit is shown in full, or else on its card, by its name."""
+        """Places in the page by the names of the fits: of a fit in full, or else of its card."""
         return self._cards | self._details
 
     def place_of(self, name: str) -> str | None:
-        """Return where in the page a fit is shown, or None."""
+        """Return the place in the page of a fit, or None."""
         return (self._details | self._cards).get(printable(name))
 
     def model_part(self) -> list[Block]:
-        """Return the model, with what quality.json says of it where there is such a file."""
+        """Return the blocks of the model, with the figure of quality.json if there is such a file."""
         out = sections.model_part(self.page, self.model())
         if (self.folder.root / "quality.json").is_file():
             out += self.page.tried(self.quality)
         return out
 
     def quality(self) -> Block:
-        """Return what quality.json says."""
+        """Return the figure of quality.json."""
         return sections.quality_part(
             self.page, read(Quality, self.folder.json("quality.json"), "quality.json", "measure it again")
         )
 
     def summary(self) -> list[Block]:
-        """Return what was fitted and how much of it is to be trusted."""
+        """Return the numbers of fits by status, medians of the trusted fits, and the fits that need review."""
         counts = Counter(fit.status for fit in self.fits)
         trusted = [fit for fit in self.fits if fit.status == "converged"]
         medians = {
-            "vertex error that such a fit expects of itself": median([fit.expected_error_mm for fit in trusted]),
-            "mean distance from model to scan, over what the scan shows": median(
+            "expected vertex error": median([fit.expected_error_mm for fit in trusted]),
+            "mean distance from model to scan, where the scan shows the surface": median(
                 [fit.distance_mm("model_to_scan") for fit in trusted]
             ),
             "mean distance from scan to model": median([fit.distance_mm("scan_to_model") for fit in trusted]),
@@ -218,29 +218,28 @@ class FolderPage:
         ]
 
     def tiles(self, counts: Mapping[str, int], medians_mm: Mapping[str, float]) -> Tiles:
-        """Return how many fits have which status, and medians of the trusted ones by what they are."""
+        """Return the number of fits by status, and the named medians of the trusted fits."""
         number_and_unit = {
             label: mm(value).removesuffix(" mm") for label, value in medians_mm.items() if isfinite(value)
         }
         return Tiles(
             [
-                (f"{counts['converged']:,}", f"of {self.total:,}", "with nothing found against them"),
-                (f"{counts['doubtful'] + counts['max_iterations']:,}", "", "to be looked at before use"),
+                (f"{counts['converged']:,}", f"of {self.total:,}", "with no problems detected"),
+                (f"{counts['doubtful'] + counts['max_iterations']:,}", "", "need review"),
                 (f"{counts['failed'] + counts['unreadable']:,}", "", "without a result"),
-                *((value, "mm", f"{label}, median of those") for label, value in number_and_unit.items()),
+                *((value, "mm", f"{label}, median of the converged fits") for label, value in number_and_unit.items()),
             ]
         )
 
     def overview(self, counts: Mapping[str, int]) -> str:
-        """Return in a sentence or two what was fitted, and how many fits have which status."""
+        """Return one or two sentences on the scans, the model, and the number of fits by status."""
         models = sorted({fit.record.model.name or "an unknown model" for fit in self.fits})
         methods = sorted({fit.record.method for fit in self.fits} - {""})
         by = f" by the {listed(methods)} method{'s' if len(methods) > 1 else ''}" if methods else ""
         trusted = counts["converged"]
         text = (
             f"{counted(len(self.fits), 'scan was', 'scans were')} fitted with {listed(models)}{by}. "
-            f"{counted(trusted, 'fit') if trusted else 'None'} converged with nothing "
-            f"{'found against them' if trusted != 1 else 'against it'}"
+            f"{counted(trusted, 'fit') if trusted else 'None'} converged with no problems detected"
         )
         others = listed(
             [
@@ -257,7 +256,7 @@ class FolderPage:
         return f"{text}; {others}." if others else f"{text}."
 
     def other_models(self) -> list[Block]:
-        """Return which fits are by another model than the one shown, where one was given."""
+        """Return the fits by another model than the model that was given, if any was given."""
         if self.model_path is None:
             return []
         return [
@@ -268,9 +267,9 @@ class FolderPage:
         ]
 
     def doubts(self) -> Notice:
-        """Return the fits that need a look, by name and reason."""
+        """Return the fits that need review, by name and reason."""
         return Notice(
-            "Not to be trusted without a look",
+            "Needs review",
             first_items(
                 [
                     Text(
@@ -286,17 +285,17 @@ class FolderPage:
         )
 
     def worst(self) -> list[Block]:
-        """Return in a sentence which fits lie farthest from their scans, of those with nothing else against them."""
+        """Return a sentence on the converged fits that lie farthest from their scans."""
         good = [fit for fit in self.fits if fit.status == "converged" and isfinite(fit.distance_mm("model_to_scan"))]
         far = sorted(good, key=lambda fit: -fit.distance_mm("model_to_scan"))[:_MOST_WORST]
         if len(good) < 2:
             return []
         farthest = listed([f"{fit.name} ({mm(fit.distance_mm('model_to_scan'))})" for fit in far])
-        which = "These" if len(good) == len(self.fits) else "Of those with nothing against them, these"
+        which = "These" if len(good) == len(self.fits) else "Of the converged fits, these"
         return [Text(f"{which} lie farthest from their scans on average: {farthest}.")]
 
     def curves(self) -> Figure:
-        """Return which share of the surface lies within each distance."""
+        """Return the figure of the share of the surface within each distance."""
         # Without stages, each curve needs the scan to be read and the distances to be measured.
         pictured = [fit for fit in self.fits if fit.pictured and (fit.entry.stages or fit.name in self.places)]
         fits, problems = sections.usable(pictured[:MOST_CURVES], self.staged)
@@ -305,8 +304,8 @@ class FolderPage:
         some = f" The first {len(fits)} fits of the table." if sum(f.pictured for f in self.fits) > len(fits) else ""
         return self.page.figure(
             figures.error_curves(fits),
-            "Share of the model's vertices that lie within each distance of the scan, one curve a fit. Vertices at "
-            f"which the scan shows nothing are not counted.{some}",
+            "Share of the model's vertices that lie within each distance of the scan, one curve per fit. Vertices "
+            f"that the scan does not show are not counted.{some}",
             alt=f"Cumulative distances of {counted(len(fits), 'fit')}",
             chart=True,
         )
@@ -345,7 +344,7 @@ class FolderPage:
     # Fits
 
     def fits_part(self) -> list[Block]:
-        """Return the gallery, the table, and the main fits in detail, folded away where there are several."""
+        """Return the gallery, the table, and the main fits in detail, folded if there are several."""
         page = self.page
         parts: list[Block] = []
         if self._cards:
@@ -367,7 +366,7 @@ class FolderPage:
         return parts
 
     def together_part(self) -> list[Block]:
-        """Return how near all fits come, and their coefficients against each other."""
+        """Return the distances of all fits, and their coefficients against each other."""
         curves: Sequence[Block] = self.page.tried(self.curves) if any(fit.pictured for fit in self.fits) else ()
         coefficients = self.page.tried(self.together)
         drawn = [block for block in coefficients if isinstance(block, Figure)]
@@ -416,7 +415,7 @@ class FolderPage:
         self.page.step(fit.name)
         seen = fit.distance_mm("scan_to_model")
         text = f"Scan to model {mm(seen)} on average. " if isfinite(seen) else ""
-        # The summary has the whole reason of these.
+        # The summary has the complete reason for these fits.
         named = [bad.name for bad in self.fits if bad.status != "converged"][:_MOST_NAMED]
         return Card(
             anchor=self._cards[fit.name],
@@ -433,7 +432,7 @@ class FolderPage:
         """Return the best picture of a fit that there is: with its stages, its fitted surface, or its scan."""
         if not fit.pictured:
             return self.page.image(
-                thumbnails.mesh_still(raw_scan(self.folder, fit)), f"The raw scan {fit.name}, as its axes stand"
+                thumbnails.mesh_still(raw_scan(self.folder, fit)), f"The raw scan {fit.name}, in its own axes"
             )
         try:
             staged = self.staged(fit)
@@ -454,7 +453,7 @@ class FolderPage:
         ]
         if len(self.fits) > MOST_ROWS:
             left = counted(len(self.fits) - MOST_ROWS, "other fit")
-            out.append(Text(f"{left} are left out here; coefficients.csv has all."))
+            out.append(Text(f"{left} are omitted here; coefficients.csv has all."))
         return [*out, Text(self.label_note, "soft")]
 
     def of_one_model(self, model_hash: str) -> list[SavedFit]:
@@ -518,7 +517,7 @@ class FolderPage:
         ]
 
     def others(self, fit: SavedFit) -> FloatArray | None:
-        """Return coefficients (N, K) of the other fits by the model of `fit`; None where there are too few."""
+        """Return coefficients (N, K) of the other fits by the model of `fit`; None if there are too few."""
         others = [o.numbers("z") for o in self.of_one_model(fit.record.model.hash) if o.name != fit.name]
         return np.stack(others) if len(others) > 2 and len({len(z) for z in others}) == 1 else None
 
@@ -559,8 +558,8 @@ def _main_fits(fits: Sequence[SavedFit]) -> list[SavedFit]:
     return doubtful[:1] + [others[k] for k in sorted({0, len(others) // 2})]
 
 
-def _carded(fits: Sequence[SavedFit]) -> list[SavedFit]:
-    """Return the fits of the gallery; where not all have room, those without a result leave some to the others."""
+def _select_cards(fits: Sequence[SavedFit]) -> list[SavedFit]:
+    """Return the fits of the gallery; if not all have room, those without a result leave some room for the others."""
     if len(fits) <= MOST_CARDS:
         return list(fits)
     empty, rest = [fit for fit in fits if not fit.fitted], [fit for fit in fits if fit.fitted]
@@ -569,7 +568,7 @@ def _carded(fits: Sequence[SavedFit]) -> list[SavedFit]:
 
 
 def _all_reasons(fit: SavedFit) -> str:
-    """Return the reasons of a fit without its status; the whole reason if the record has no codes."""
+    """Return the reasons of a fit without its status; the complete reason if the record has no codes."""
     return sentence("; ".join(fit.reason_texts)) if fit.reason_texts else fit.reason
 
 
@@ -585,11 +584,10 @@ def _first_reason(fit: SavedFit) -> str:
 
 
 def find_labels(folder: Folder, fits: Sequence[SavedFit], labels_path: Path | None) -> tuple[list[Label | None], str]:
-    """Return the label of each fit, and sentences on their source and on what has no label, or on the reason why there
-    are none.
+    """Return the label of each fit, and sentences on the source of the labels and on fits without a label.
 
-    They are looked for in `labels_path`, else in labels.csv in `folder`, else beside the scans. They are matched by the
-    name of the fit or of the scan's file.
+    Labels are read from `labels_path`, or from labels.csv in `folder`, or next to the scans. They are matched by the
+    name of the fit or of the scan's file. Without labels, the sentences state the reason.
 
     Raises:
         FileError: `labels_path` cannot be read.
@@ -605,7 +603,7 @@ def find_labels(folder: Folder, fits: Sequence[SavedFit], labels_path: Path | No
             if path and "\0" not in path
         )
         places = [file for file in beside if file.is_file()]
-        source = f"{listed([f'{file.parent.name}/{LABELS_FILE}' for file in places])}, beside the scans"
+        source = f"{listed([f'{file.parent.name}/{LABELS_FILE}' for file in places])}, next to the scans"
     names = [(fit.name, *names_of_file(fit.record.scan.name or fit.name)) for fit in fits]
     labels: list[Label | None] = [None] * len(fits)
     sentences = [f"Labels are from {source}."] if places else []
@@ -626,10 +624,10 @@ def with_label(fit: SavedFit, label: Label | None) -> SavedFit:
 
 
 WORST = {"failed": 12, "doubtful": 60, "max_iterations": 20, "converged": 60}
-"""How many fits of each status are looked at, the worst first."""
+"""Number of fits of each status on the page, the worst first."""
 
 MOST_SINGLE, MOST_STORED = 10_000, 2_000
-"""Fits of which a folder of single files, and a store, are reported with one row for each."""
+"""Largest number of fits of a folder of single files, and of a store, that are reported with one row for each fit."""
 
 # Items on a page, and points in a picture: what can be looked through without paging.
 _FARTHEST, _MOST_REASONS, _MOST_NOTED, _MOST_LINES, _IN_PICTURE = 20, 20, 24, 6, 400
@@ -642,14 +640,14 @@ def is_many(results: Results) -> bool:
 
 
 class ManyPage(FolderPage):
-    """The report of very many fits in the making; the page of a folder, whose fits are those to look at.
+    """Builder of the report of very many fits: a `FolderPage` of the fits to review, with distributions of all fits.
 
     Args:
-        folder: that the fits lie in.
-        results: of it.
+        folder: folder of the fits.
+        results: results of the folder.
         page: page that it fills.
-        model: the model's file, or None to go by the records.
-        labels: a table of labels, or None to look for one.
+        model: file of the model; None for the path in the records.
+        labels: table of labels; None to look for one.
 
     Raises:
         InputError: none of the fits can be read.
@@ -700,7 +698,7 @@ class ManyPage(FolderPage):
         ]
 
     def summary(self) -> list[Block]:
-        """Return how many fits have which status and why, what stands out, and what could not be read."""
+        """Return the number of fits by status, the reasons, the groups that differ, and the unreadable files."""
         return [
             self.tiles(
                 self.population.counts,
@@ -724,7 +722,7 @@ class ManyPage(FolderPage):
         )
 
     def stands_out(self) -> Notice:
-        """Return which times and sites differ from the rest by more than chance."""
+        """Return the times and sites that differ from the rest by more than chance."""
         return Notice(
             "Differ from all the others",
             first_items(
@@ -742,7 +740,7 @@ class ManyPage(FolderPage):
         )
 
     def reasons(self) -> list[Block]:
-        """Return why fits are not trusted, and how often."""
+        """Return the reasons why fits are not trusted, with their frequencies."""
         most = self.population.n_reasons.most_common(_MOST_REASONS)
         if not most:
             return []
@@ -774,8 +772,8 @@ class ManyPage(FolderPage):
         measures = {words: self.population.measures[key] for key, words in MEASURES.items()}
         return self.page.figure(
             figures.distributions_figure(measures, self.population.trusted, title=f"How near {every} come"),
-            "Distances over what the scan shows, and the error that a fit expects of itself. The last bar holds all "
-            "that lies beyond.",
+            "Distances where the scan shows the surface, and the expected vertex error. The last bar contains all "
+            "larger values.",
             alt=f"Histograms of {listed(list(measures))} of {every}",
             chart=True,
         )
@@ -797,7 +795,7 @@ class ManyPage(FolderPage):
             figures.density_figure(
                 self._trusted_z(), self._far[self.population.trusted], title="Where in the shape space"
             ),
-            "How many trusted fits lie where, darker for more, by the logarithm; the farthest are left out. Dashed: "
+            "Density of the trusted fits, on a logarithmic scale; the farthest fits are omitted. Dashed: "
             "three standard deviations. Right: how far each fit is from the mean in all coefficients.",
             alt="Density of z1 against z2 and z3, and a histogram of the root mean square of all coefficients",
             chart=True,
@@ -841,13 +839,13 @@ class ManyPage(FolderPage):
     # Time and site
 
     def drift(self) -> list[Block]:
-        """Return how errors and coefficients go with what the scans were listed with."""
+        """Return the relation of errors and coefficients to the metadata of the scans."""
         columns = self.population.listed[:_MOST_COLUMNS]
         if not columns:
             return [
                 Text(
                     "The scans were listed without columns such as a date or a site; give them in the list of scans to "
-                    "see how the fits go with them.",
+                    "see how the fits depend on them.",
                     "soft",
                 )
             ]
@@ -858,9 +856,9 @@ class ManyPage(FolderPage):
         return [*parts, Text(f"Not shown: {listed(left)}." if left else "", "soft")]
 
     def by(self, column: ListedColumn) -> list[Block]:
-        """Return how the fits go with one column."""
+        """Return the relation of the fits to one column."""
         people, trusted = self.population, self.population.trusted
-        # Errors are of trusted fits; the number of the others is given beside them.
+        # Errors are those of trusted fits; the number of the other fits is in the same table.
         measures = {words: np.where(trusted, people.measures[key], np.nan) for key, words in MEASURES.items()}
         error = next(iter(MEASURES.values()))
         if column.kind == "level":
@@ -870,7 +868,9 @@ class ManyPage(FolderPage):
                 words=error,
                 title=f"By {column.name}",
             )
-            caption = "Of each: the median of the trusted fits, the middle half and the middle 90 %. Dashed: of all."
+            caption = (
+                "Of each group: the median of the trusted fits, the middle half and the middle 90 %. Dashed: of all."
+            )
         else:
             levels = next((other for other in people.listed if 1 < len(other.levels) <= _MOST_LINES), None)
             lines = [] if levels is None else [(name, inside) for name, inside, _ in levels.groups()]
@@ -889,7 +889,7 @@ class ManyPage(FolderPage):
     def _compared(self, column: ListedColumn) -> Table:
         heads = [
             Column(column.name), Column("Fits", "number"), Column("Not trusted, %", "number"),
-            Column("Expected error, median", "number"), Column("Beside all", "number"),
+            Column("Expected error, median", "number"), Column("Compared with all", "number"),
             Column("Coefficient that differs most", "number"), Column("Stands out"),
         ]  # fmt: skip
         rows = [
@@ -914,7 +914,7 @@ class ManyPage(FolderPage):
     # Fits to look at
 
     def numbers(self) -> list[Block]:
-        """Return the table of the fits that are looked at."""
+        """Return the table of the fits on the page."""
         wanted = listed([f"{most} {STATUS_WORDS[kind]}" for kind, most in WORST.items()])
         text = (
             f"Of {counted(len(self.population), 'fit')} these {len(self.fits)}: the worst of each status ({wanted}), "
@@ -927,7 +927,7 @@ class ManyPage(FolderPage):
         ]
 
     def together(self) -> list[Block]:
-        """Return the first coefficients of the fits that are looked at, to be turned."""
+        """Return the first coefficients of the fits on the page, to be turned."""
         points = [*map(sections.coefficients_of, self.of_one_model(self.model_hash()))]
         return [*self.page.tried(lambda: sections.scatter_to_turn(self.page, points))]
 
@@ -942,7 +942,7 @@ class ManyPage(FolderPage):
         )
 
     def settings(self) -> list[Block]:
-        """Return methods, versions and models, and of how many fits they are."""
+        """Return methods, versions and models, each with its number of fits."""
         rows = [("Report", f"shapespace {__version__}")]
         for key, heading in {"method": "Methods", "version": "Versions of shapespace", "model_name": "Models"}.items():
             rows += [

@@ -1,4 +1,4 @@
-"""A self-contained page: style, scripts, pictures and payloads inside; sections fail by themselves."""
+"""A self-contained page: style, scripts, pictures and payloads inside; a failed section leaves the others intact."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _SHELL_BYTES = 250_000  # bytes of scripts and styles of a page
 _RESERVE_BYTES = 700_000  # bytes that stay free for tables and text after the last picture
 
 Step = Callable[[str, int], None]
-"""Called with what was just made and about how many such things there will be, for a progress bar."""
+"""Called with the name of a finished item and the expected number of items, for a progress bar."""
 
 _T = TypeVar("_T")
 Make: TypeAlias = Callable[[], Block | Sequence[Block]]
@@ -47,14 +47,14 @@ class Chapter:
 
 
 class Page:
-    """A page in the making: what it embeds, how many bytes are spent so far, and where its sections failed.
+    """Builder of a page: embedded data, the number of bytes so far, and the reasons of sections that failed.
 
     Args:
         on_step: called after each picture.
     """
 
     planned: int = 1
-    """About how many pictures there will be."""
+    """Expected number of pictures."""
 
     def __init__(self, on_step: Step | None = None) -> None:
         self._on_step = on_step
@@ -69,13 +69,13 @@ class Page:
         return LARGEST_REPORT_BYTES - self.spent
 
     def once(self, key: object, load: Callable[[], _T]) -> _T:
-        """Return what `load` returned when it was first called for `key`."""
+        """Return the value that `load` returned when it was first called for `key`."""
         if key not in self._loaded:
             self._loaded[key] = load()
         return self._loaded[key]
 
     def step(self, name: str) -> None:
-        """Tell the progress bar what was just made."""
+        """Report a finished item to the progress bar."""
         if self._on_step is not None:
             self._on_step(name, self.planned)
 
@@ -106,7 +106,7 @@ class Page:
         )
 
     def tried(self, make: Make) -> Sequence[Block]:
-        """Return what `make` gives, or why it could not."""
+        """Return the result of `make`, or the reason why it failed."""
         try:
             made = make()
         except ShapespaceError as error:
@@ -114,7 +114,7 @@ class Page:
         return made if isinstance(made, Sequence) else [made]
 
     def failed(self, error: ShapespaceError) -> Text:
-        """Return why a part of the page could not be made."""
+        """Return the reason why a part of the page could not be made."""
         return Text(f"This part could not be made. {error}", "broken")
 
     def oriented(self, orientation: Orientation | None) -> AbstractContextManager[None]:
@@ -122,13 +122,13 @@ class Page:
         return figures.oriented(orientation)
 
     def figure(self, figure: Drawing, caption: str, *, alt: str, chart: bool = False) -> Figure:
-        """Return a drawing with its caption; `alt` says what is seen in it."""
+        """Return a drawing with its caption; `alt` describes the drawing."""
         still = self.still(figure, alt, lossless=chart)
         self.step(caption)
         return Figure(still, caption, "chart" if chart else "drawing")
 
     def still(self, figure: Drawing, alt: str, *, lossless: bool = False) -> Image:
-        """Return a drawing as an image of this page, such as the still of something that turns."""
+        """Return a drawing as an image of this page, such as the still picture of a widget."""
         return self.image(figures.encode_webp(figure, lossless=lossless), alt)
 
     def image(self, still: Still, alt: str) -> Image:
@@ -146,15 +146,15 @@ class Page:
         label: str,
         still: str,
     ) -> Turning | Figure:
-        """Return something that turns, or its still alone where the page would grow too large.
+        """Return a widget, or only its still picture if the page would grow too large.
 
         Args:
-            widget: as of `blocks.Turning`, as all the others but
-            payload: what it shows, from `report.render.scene`.
-            poster: the still.
-            caption: of both.
-            label: what it is.
-            still: what the still shows.
+            widget: name of the widget, see `blocks.Turning`.
+            payload: data that the widget shows, from `report.render.scene`.
+            poster: still picture.
+            caption: caption of the widget and of the still picture.
+            label: description for screen readers.
+            still: description of the still picture, printed with it only.
         """
         name = f"payload-{len(self._payloads) + 1}"
         if not self._payloads:
@@ -169,13 +169,13 @@ class Page:
         return Turning(widget, name, poster, caption, label, still)
 
     def html(self, title: str, lead: Sequence[Block], made: str, chapters: Sequence[Chapter]) -> str:
-        """Return the whole page.
+        """Return the complete page.
 
         Args:
-            title: of the page.
-            lead: below the title.
-            made: by what and when.
-            chapters: its parts in order.
+            title: title of the page.
+            lead: blocks below the title.
+            made: sentence on the version and the source of the page.
+            chapters: chapters of the page in order.
         """
         from markupsafe import Markup
 

@@ -81,13 +81,13 @@ class PartsFile:
     """A kind of file with parts.
 
     Args:
-        file: its name.
-        struct: its content.
-        again: the advice for a damaged file.
-        word: a noun for its content.
-        article: the same with its article.
-        title: default title of its page.
-        lead: first sentence of its page.
+        file: name of the file.
+        struct: type of the content.
+        again: advice for a damaged file.
+        word: noun for the content.
+        article: noun for the content, with its article.
+        title: default title of the page.
+        lead: first sentence of the page.
     """
 
     file: str
@@ -110,7 +110,7 @@ STUDY = PartsFile(
     word="study",
     article="a study",
     title="Recognition study",
-    lead="What a study of recognition measured",
+    lead="Results of a study of recognition",
 )
 ANALYSIS = PartsFile(
     file=Analysis.FILE,
@@ -119,7 +119,7 @@ ANALYSIS = PartsFile(
     word="analysis",
     article="an analysis",
     title="Analysis",
-    lead="What an analysis of shapes found",
+    lead="Results of an analysis of shapes",
 )
 MOST_ROWS, MOST_PARAGRAPH = 500, 2000  # rows and characters of a paragraph that a page shows: bounds its length
 _MOST_COLUMNS = 30  # columns; a wider table is unreadable, and probably damage
@@ -136,18 +136,18 @@ TITLES = {
     "deformation": "Deformation",
     "text": "Notes",
 }
-"""Of parts without one, by kind."""
+"""Titles of parts without a title, by kind."""
 Drawn = tuple[Any, str, str]
-"""A drawing, its caption where the part has no note, and what is seen in it."""
+"""A drawing, its caption if the part has no note, and its alternative text."""
 
 
 class StudyParts:
     """Converts parts into blocks of a page.
 
     Args:
-        page: that they go to.
-        folder: with the arrays and meshes that they name.
-        parts_file: the kind of file that holds them.
+        page: page of the blocks.
+        folder: folder with the arrays and meshes that the parts name.
+        parts_file: kind of the file of the parts.
     """
 
     def __init__(self, page: Page, folder: Folder, parts_file: PartsFile) -> None:
@@ -195,7 +195,7 @@ class StudyParts:
         ]
         out: list[Block] = [Table(heads, cells, note or title, sortable=len(cells) > 1)]
         if len(part.rows) > MOST_ROWS:
-            out.append(Text(f"{counted(len(part.rows) - MOST_ROWS, 'other row')} are left out."))
+            out.append(Text(f"{counted(len(part.rows) - MOST_ROWS, 'other row')} are omitted."))
         return out
 
     def confusion(self, part: ConfusionPart, title: str, note: str) -> list[Block]:
@@ -229,7 +229,7 @@ class StudyParts:
 
     def calibration(self, part: CalibrationPart, title: str, note: str) -> list[Block]:
         """Return the reliability diagram."""
-        bins = np.array([structs.astuple(one) for one in part.bins], dtype=np.float64).reshape(-1, 5)
+        bins = np.array([structs.astuple(interval) for interval in part.bins], dtype=np.float64).reshape(-1, 5)
         figure = figures.calibration_figure(bins, ece=part.ece, brier=part.brier)
         points = [f"stated {percent(p)}, right {percent(right)}" for _, _, p, right, count in bins if count > 0]
         error = "" if part.ece is None else f"; expected calibration error {100 * part.ece:.1f} points"
@@ -267,23 +267,23 @@ class StudyParts:
     def curve(self, part: CurvePart, title: str, note: str) -> list[Block]:
         """Return one measure against another."""
         x, y = part.x or "x", part.y or "y"
-        ends = [(one.low, one.high) for one in part.series]
+        ends = [(line.low, line.high) for line in part.series]
         figure = figures.curve_figure(
-            [(one.label, one.x, one.y) for one in part.series],
+            [(line.label, line.x, line.y) for line in part.series],
             x=x,
             y=y,
             bands=[
                 None if low is None or high is None else ([*map(known, low)], [*map(known, high)]) for low, high in ends
             ],
-            dots=[one.points for one in part.series],
+            dots=[line.points for line in part.series],
             scales=(part.x_scale, part.y_scale),
             diagonal=part.diagonal,
-            groups=[one.group for one in part.series],
+            groups=[line.group for line in part.series],
         )
         ranges = [
-            f"{one.label or y} from {one.y[0]:.3g} at {one.x[0]:g} to {one.y[-1]:.3g} at {one.x[-1]:g}"
-            for one in part.series
-            if one.x and one.y
+            f"{line.label or y} from {line.y[0]:.3g} at {line.x[0]:g} to {line.y[-1]:.3g} at {line.x[-1]:g}"
+            for line in part.series
+            if line.x and line.y
         ]
         about = f"{y[:1].upper()}{y[1:]} against {x}."
         about += (" Bands: its interval." if any(low is not None for low, _ in ends) else "") + (
@@ -324,7 +324,7 @@ class StudyParts:
         ]
 
     def morph(self, part: MorphPart, title: str, note: str) -> list[Block]:
-        """Return two shapes between which a slider moves; beside each other where nothing turns."""
+        """Return two shapes with a slider between them; as the fallback, next to each other."""
         low, high, faces = self._arrays(part.arrays, (part.low, part.high, part.faces))
         if low.shape != high.shape:
             raise self.parts_file.damaged("the two shapes of a morph have different numbers of vertices")
@@ -352,8 +352,8 @@ class StudyParts:
     def deformation(self, part: DeformationPart, title: str, note: str) -> list[Block]:
         """Return two configurations of landmarks as deformation grids, or as vectors."""
         low, high = (
-            self._mesh(one, np.zeros((0, 3), np.intp)).vertices
-            for one in self._arrays(part.arrays, (part.low, part.high))
+            self._mesh(points, np.zeros((0, 3), np.intp)).vertices
+            for points in self._arrays(part.arrays, (part.low, part.high))
         )
         if low.shape != high.shape:
             raise self.parts_file.damaged("two configurations have different numbers of landmarks")
@@ -371,10 +371,10 @@ class StudyParts:
     def histogram(self, part: HistogramPart, title: str, note: str) -> list[Block]:
         """Return a histogram."""
         figure = figures.histogram_figure(
-            part.edges, [(one.label, one.counts) for one in part.series], x=part.x, y=part.y, observed=part.observed,
-            observed_label=part.observed_label or "observed",
+            part.edges, [(group.label, group.counts) for group in part.series], x=part.x, y=part.y,
+            observed=part.observed, observed_label=part.observed_label or "observed",
         )  # fmt: skip
-        many = [f"{one.label} {sum(one.counts):g}".strip() for one in part.series]
+        many = [f"{group.label} {sum(group.counts):g}".strip() for group in part.series]
         about = f"Counts: {listed(many)}." if part.y == "count" else ""
         if part.observed is not None:
             about += f" Dashed line: {part.observed_label or 'observed'}, {part.observed:.3g}."
@@ -404,10 +404,10 @@ class StudyParts:
     def _arrays(self, name: str, names: Sequence[str]) -> list[npt.NDArray[Any]]:
         """Return arrays of a file by their names."""
         arrays = self.folder.arrays(name)
-        absent = [one for one in names if one not in arrays]
+        absent = [array for array in names if array not in arrays]
         if absent:
-            raise FileFormatError(f"{name} holds no array {absent[0]!r}; {self.parts_file.again}.")
-        return [arrays[one] for one in names]
+            raise FileFormatError(f"{name} contains no array {absent[0]!r}; {self.parts_file.again}.")
+        return [arrays[array] for array in names]
 
     def _mesh(self, vertices: npt.NDArray[Any], faces: npt.NDArray[Any]) -> Mesh:
         """Return a surface of arrays; without triangles, points."""
@@ -467,13 +467,13 @@ _MOST_PARTS, _MOST_TEXT = 120, 400
 _PART_BYTES = 700_000  # bytes that one part of a study takes with its figures
 _MOST_NOTES = 40  # notes on the page; the file has all
 _BESIDE = ("confusion", "calibration", "learning_curve", "curve", "histogram")
-"""Kinds of parts that share the page's width with their neighbour; the views of a surface map need all of it."""
+"""Kinds of parts that share the page's width with their neighbour; the views of a surface map need the full width."""
 _CHAPTER = 2  # level of parts that begin a chapter (`Part` in schemas)
 _T = TypeVar("_T")
 
 
 def standalone_file(folder: Folder) -> PartsFile | None:
-    """Return what `folder` holds where it holds no fit, so that there is nothing else to report; None for neither.
+    """Return the kind of the file with parts in `folder` if there are no fits to report; None if there is neither.
 
     A file without a format is a free collection of scores, which is no study.
     """
@@ -487,8 +487,8 @@ def study_page(folder: Folder, parts_file: PartsFile, page: Page) -> str:
     """Return the report of a study or an analysis alone.
 
     Args:
-        folder: with its file.
-        parts_file: which of them it is.
+        folder: folder with the file.
+        parts_file: kind of the file.
         page: page that it fills.
 
     Raises:
@@ -496,11 +496,11 @@ def study_page(folder: Folder, parts_file: PartsFile, page: Page) -> str:
         FileFormatError: it is damaged, or no file of this format.
     """
     content = _content(folder, parts_file)
-    page.planned = max(sum(_raw(part, "kind") not in ("table", "text") for part in _raw_parts(content)), 1)
+    page.planned = max(sum(_raw_value(part, "kind") not in ("table", "text") for part in _raw_parts(content)), 1)
     study = _Study(page, folder, parts_file, content)
     name = folder.root.resolve().name
     created = f", {moment(study.head['created'])}" if study.head["created"] else ""
-    targets_text = ", beside the targets that were set for it" if content.get("targets") else ""
+    targets_text = ", compared with the targets that were set for it" if content.get("targets") else ""
     return page.html(
         study.head["title"] or f"{parts_file.title} in {name}",
         [
@@ -524,12 +524,12 @@ def study_page(folder: Folder, parts_file: PartsFile, page: Page) -> str:
 
 
 def study_section(page: Page, folder: Folder, parts_file: PartsFile = STUDY) -> list[Block]:
-    """Return what a study measured or an analysis found, as a section of the report of fits.
+    """Return the results of a study or an analysis, as a section of the report of fits.
 
     Args:
-        page: that it goes to.
-        folder: with its file.
-        parts_file: which of them it is.
+        page: page of the section.
+        folder: folder with the file.
+        parts_file: kind of the file.
 
     Raises:
         FileError: the file cannot be read.
@@ -546,7 +546,7 @@ def study_section(page: Page, folder: Folder, parts_file: PartsFile = STUDY) -> 
 
 
 def find_analyses(root: Path) -> list[Folder]:
-    """Return the folders that hold an analysis.json: `root` itself, and those directly in it, by name."""
+    """Return the folders with an analysis.json: `root` itself, and those directly in it, by name."""
     inside: list[Path] = []
     with os.scandir(root) as entries:
         # A link may lead anywhere.
@@ -558,9 +558,9 @@ def analysis_chapters(page: Page, root: Path, folders: Sequence[Folder]) -> list
     """Return a chapter for each of `folders` from `find_analyses`, up to MOST_ANALYSES.
 
     Args:
-        page: that they go to.
-        root: of the fits.
-        folders: of the analyses.
+        page: page of the chapters.
+        root: folder of the fits.
+        folders: folders of the analyses.
     """
     out: list[Chapter] = []
     for folder in folders[:MOST_ANALYSES]:
@@ -583,27 +583,26 @@ def _analysis(page: Page, folder: Folder, root: Path) -> list[Block]:
 
 
 def _content(folder: Folder, parts_file: PartsFile) -> dict[str, Any]:
-    return cast(dict[str, Any], _shortened(Folder(folder.root, parts_file.again).json(parts_file.file)))
+    return cast(dict[str, Any], _shorten(Folder(folder.root, parts_file.again).json(parts_file.file)))
 
 
-def _shortened(value: object, most: int = _MOST_TEXT) -> object:
+def _shorten(value: object, most: int = _MOST_TEXT) -> object:
     """Return JSON content whose texts are lines of bounded length."""
     if isinstance(value, str):
         line = " ".join(value.split())
         return line if len(line) <= most else f"{line[: most - 1]}…"
     if isinstance(value, list):
-        return [_shortened(item, most) for item in cast(list[object], value)]
+        return [_shorten(item, most) for item in cast(list[object], value)]
     if isinstance(value, dict):
         mapping = cast(dict[str, object], value)
         long = ("note", "notes", "text", "summary", "settings")
         return {
-            str(_shortened(key)): _shortened(item, MOST_PARAGRAPH if key in long else most)
-            for key, item in mapping.items()
+            str(_shorten(key)): _shorten(item, MOST_PARAGRAPH if key in long else most) for key, item in mapping.items()
         }
     return value
 
 
-def _raw(part: object, key: str) -> object:
+def _raw_value(part: object, key: str) -> object:
     return cast(dict[str, object], part).get(key) if isinstance(part, dict) else None
 
 
@@ -613,7 +612,7 @@ def _raw_parts(content: Mapping[str, object]) -> list[object]:
 
 
 class _Study:
-    """A study or an analysis and the page that it goes to; each key of its file is read when it is shown."""
+    """A study or an analysis and its page; each key of its file is read when it is shown."""
 
     def __init__(self, page: Page, folder: Folder, parts_file: PartsFile, content: Mapping[str, Any]) -> None:
         check_format(content, parts_file.struct, parts_file.file, parts_file.again)
@@ -631,14 +630,14 @@ class _Study:
         return read(kind, self.content.get(key), f"{self.parts_file.file}: {key}", self.parts_file.again)
 
     def summary(self) -> list[Block]:
-        """Return its sentences, what it aimed at beside what it reached, and who was left out."""
+        """Return its sentences, its targets with the results, and its notes."""
         makers: Mapping[str, Make] = {"summary": self.sentences, "targets": self.targets, "notes": self.notes}
         return [block for key, make in makers.items() if self.content.get(key) for block in self.page.tried(make)]
 
     def notes(self) -> Notice:
-        """Return what should be known of it, such as who was left out."""
+        """Return its notes, such as those on excluded shapes."""
         return Notice(
-            "To be known",
+            "Notes",
             first_items(
                 [*map(without_folders, self._read("notes", tuple[str, ...]))],
                 _MOST_NOTES,
@@ -654,31 +653,31 @@ class _Study:
         return paragraphs(text if isinstance(text, str) else self._read("summary", tuple[str, ...]))
 
     def targets(self) -> Table:
-        """Return the targets, each with what was reached."""
+        """Return the targets, each with the result."""
         targets = self._read("targets", tuple[Target, ...])
         met = [target.met for target in targets if target.met is not None]
-        caption = f"{sum(met)} of {counted(len(met), 'target')} met" if met else "Targets, and what was reached"
+        caption = f"{sum(met)} of {counted(len(met), 'target')} met" if met else "Targets and results"
         if met and len(met) < len(targets):
             caption += f", {len(targets) - len(met)} without a verdict"
         verdicts = {None: Cell(DASH), True: Cell("met", status="converged"), False: Cell("missed", status="failed")}
         rows = [
             [
-                *(Cell(text or DASH) for text in (one.what, one.target, one.reached)),
-                verdicts[one.met],
-                Cell(one.note or DASH),
+                *(Cell(text or DASH) for text in (target.what, target.target, target.reached)),
+                verdicts[target.met],
+                Cell(target.note or DASH),
             ]
-            for one in targets[:MOST_ROWS]
+            for target in targets[:MOST_ROWS]
         ]
         columns = [Column(head) for head in ("What", "Target", "Reached", "Verdict", "Note")]
-        shown_columns = 5 if any(one.note for one in targets) else 4
+        shown_columns = 5 if any(target.note for target in targets) else 4
         return Table(columns[:shown_columns], [row[:shown_columns] for row in rows], f"{caption}.", stack=True)
 
     def chapters(self, first: str, level: int) -> list[tuple[str, Make]]:
-        """Return headings of chapters and what makes each; what stands before them goes under `first`.
+        """Return headings of chapters, each with its function; parts before the first chapter go under `first`.
 
         Args:
             first: heading of the parts before the first chapter.
-            level: of the headings of parts inside a chapter.
+            level: level of the headings of parts inside a chapter.
         """
         if self.content.get("parts") is None:
             return []
@@ -687,7 +686,7 @@ class _Study:
         parts = _raw_parts(self.content)
         groups: list[tuple[str, list[object], list[object]]] = [(first, [], [])]
         for part in parts[:_MOST_PARTS]:
-            if _raw(part, "level") == _CHAPTER:
+            if _raw_value(part, "level") == _CHAPTER:
                 groups.append((_title(part), [part], []))
             else:
                 groups[-1][2].append(part)
@@ -698,7 +697,7 @@ class _Study:
             body = [block for part in own for block in self.body(part)]
             body += self.parts(inner, level if heading else level - 1)
             if inner is groups[-1][2] and len(parts) > _MOST_PARTS:
-                body.append(Text(f"{len(parts) - _MOST_PARTS} parts are left out."))
+                body.append(Text(f"{len(parts) - _MOST_PARTS} parts are omitted."))
             return body
 
         return [
@@ -707,20 +706,20 @@ class _Study:
         ]
 
     def no_parts(self) -> list[Block]:
-        """Refuse parts that are no list."""
+        """Raise the error of parts that are not a list."""
         raise self.parts_file.damaged("its parts are no list")
 
     def parts(self, parts: Sequence[object], level: int) -> list[Block]:
         """Return parts under their headings, charts that follow each other side by side."""
         out: list[Block] = []
-        for is_chart, run in groupby(parts, lambda part: _raw(part, "kind") in _BESIDE):
+        for is_chart, run in groupby(parts, lambda part: _raw_value(part, "kind") in _BESIDE):
             made = [self.page.section(_title(part), lambda part=part: self.body(part), level) for part in run]
             out += [Group("beside", made)] if is_chart and len(made) > 1 else made
         return out
 
     def body(self, part: object) -> Sequence[Block]:
         """Return a part without its heading, or why it is not shown."""
-        too_large = [Text("This part would make this file larger than 8 MB, so it is left out.", "soft")]
+        too_large = [Text("This part would make this file larger than 8 MB, so it is omitted.", "soft")]
         before = self.page.left
         if before < _PART_BYTES:
             return too_large
@@ -733,13 +732,13 @@ class _Study:
 
     def part(self, part: object) -> list[Block]:
         """Return a part by its kind."""
-        one = read_part(part, self.parts_file.file, self.parts_file.again)
+        typed_part = read_part(part, self.parts_file.file, self.parts_file.again)
         known = self.content.get("orientation") is not None
         with self.page.oriented(self._read("orientation", Orientation) if known else None):
-            return self.kinds.blocks(one, _title(part))
+            return self.kinds.blocks(typed_part, _title(part))
 
     def settings(self) -> list[Block]:
-        """Return with what the study was made."""
+        """Return settings, versions and model hashes of the study."""
         rows = {"Report": f"shapespace {__version__}"}
         if self.head["version"]:
             rows[self.parts_file.word.capitalize()] = f"shapespace {self.head['version']}"
@@ -761,7 +760,7 @@ class _Study:
     def hashes(self) -> Folded:
         """Return the hashes of the models that took part."""
         hashes = self._read("model_hashes", tuple[str, ...])
-        rows = [[str(k), one] for k, one in enumerate(hashes[:MOST_ROWS], 1)]
+        rows = [[str(k), model_hash] for k, model_hash in enumerate(hashes[:MOST_ROWS], 1)]
         return Folded(
             f"Content hashes (SHA-256) of {counted(len(hashes), 'model')}",
             [text_table(("Model", "Hash"), rows, "Content hashes of the models")] if rows else [],
@@ -769,5 +768,5 @@ class _Study:
 
 
 def _title(part: object) -> str:
-    title, kind = _raw(part, "title"), str(_raw(part, "kind"))
+    title, kind = _raw_value(part, "title"), str(_raw_value(part, "kind"))
     return title[:200] if isinstance(title, str) and title else TITLES.get(kind, "A part")

@@ -46,7 +46,7 @@ def require_report_extra() -> None:
     """Raise unless the packages that draw are installed.
 
     Raises:
-        ShapespaceError: they are not; the sentence says how to install them.
+        ShapespaceError: a package is missing; the message states how to install it.
     """
     missing = [name for name in ("jinja2", "matplotlib", "PIL") if find_spec(name) is None]
     if missing:
@@ -67,22 +67,22 @@ def write_report(
 
     A folder with a demo.json is reported as the demo, one with a correspondence.json as a correspondence, one with a
     recognition.json and no fits as a study of recognition, one with an analysis.json and no fits as an analysis, any
-    other as the results of `shapespace fit`; of very many fits those to look at have rows and pictures, and all are in
+    other as the results of `shapespace fit`; of very many fits those to review have rows and pictures, and all are in
     the distributions. Analyses in the folder of fits, or in folders directly in it, are sections of its report. The
-    page needs no network; without a script it loses what turns and sorts, and can be read.
+    page needs no network; without scripts it can be read, but nothing turns or sorts.
 
     Args:
-        folder: of the results.
-        output: the file; None writes `folder`/report.html.
-        model: file of the model of the fits; None goes by their records. The demo names its own, a study has none.
-        labels: table of labels of the scans; None looks for labels.csv in `folder`, then beside the scans.
+        folder: folder of the results.
+        output: file of the report; None writes `folder`/report.html.
+        model: file of the model of the fits; None for the path in their records. Not for a demo or a study.
+        labels: table of labels of the scans; None looks for labels.csv in `folder`, then next to the scans.
         on_step: called after each picture.
 
     Raises:
         FileError: the folder, demo.json, `model` or `labels` cannot be read, or the report cannot be written.
-        FileFormatError: demo.json, correspondence.json or the mean shape beside it, the recognition.json of a study,
+        FileFormatError: demo.json, correspondence.json or the mean shape next to it, the recognition.json of a study,
             the analysis.json of an analysis, `model` or `labels` is damaged.
-        InputError: the folder holds no results, or only records that cannot be read, or `model` is not of its fits.
+        InputError: the folder contains no results, or only records that cannot be read, or `model` is not of its fits.
         ShapespaceError: the extra `report` is not installed.
     """
     require_report_extra()
@@ -96,17 +96,15 @@ def _html(folder: Folder, model: Path | None, labels: Path | None, page: Page) -
     root, given = folder.root, model is not None or labels is not None
     if (root / "demo.json").is_file():
         if given:
-            raise InputError(
-                f"{root} is a demo, which names its models and labels itself; leave out --model and --labels."
-            )
+            raise InputError(f"{root} is a demo, which names its models and labels itself; omit --model and --labels.")
         return DemoPage(folder, page).html()
     if (root / CorrespondenceRecord.FILE).is_file():
         if given:
-            raise InputError(f"{root} is a correspondence without fits; leave out --model and --labels.")
+            raise InputError(f"{root} is a correspondence without fits; omit --model and --labels.")
         return CorrespondencePage(folder, page).html()
     if (standalone := standalone_file(folder)) is not None:
         if given:
-            raise InputError(f"{root} holds {standalone.article} without fits; leave out --model and --labels.")
+            raise InputError(f"{root} contains {standalone.article} without fits; omit --model and --labels.")
         return study_page(folder, standalone, page)
     if is_many(results := Results(root)):
         return ManyPage(folder, results, model=model, labels=labels, page=page).html()
@@ -123,7 +121,7 @@ class FigureConfig:
     Args:
         formats: formats of the figures: svg, pdf, png.
         dpi: resolution of PNG figures, and of surfaces in SVG and PDF.
-        views: names of the views to draw, from the orientation (default: all of it).
+        views: names of the views to draw, from the orientation (default: all views).
         orientation: JSON file with named views of the object, such as dorsal, and links between landmarks (default:
             that of the analysis).
 
@@ -152,7 +150,7 @@ class FigureConfig:
         Raises:
             FileError: the file cannot be read.
             FileFormatError: it is damaged.
-            InputError: a view that there is not.
+            InputError: a view that does not exist.
         """
         found = own if self.orientation is None else find_orientation(self.orientation, ())
         if not self.views:
@@ -185,7 +183,7 @@ class _FigureFiles(Page):
 
     @property
     def left(self) -> int:
-        """Number of bytes that the page has left: files need none of it."""
+        """Number of bytes left in the page; constant, since files do not count."""
         return LARGEST_REPORT_BYTES
 
     def oriented(self, orientation: Orientation | None) -> AbstractContextManager[None]:
@@ -200,24 +198,24 @@ class _FigureFiles(Page):
         return section
 
     def failed(self, error: ShapespaceError) -> Text:
-        """Keep why a figure could not be drawn."""
+        """Record the reason why a figure could not be drawn."""
         self.notes.append(f"The figure {self.headings[-1]!r} could not be drawn: {error}")
         return super().failed(error)
 
     def still(self, figure: Drawing, alt: str, *, lossless: bool = False) -> Image:
-        """Keep a drawing."""
+        """Record a drawing."""
         self.drawn.append((self.headings[0], self.headings[-1], figure))
         return Image(b"", (1, 1), alt)
 
     def figure(self, figure: Drawing, caption: str, *, alt: str, chart: bool = False) -> Figure:
-        """Keep a drawing with its caption."""
+        """Record a drawing with its caption."""
         self.captions[figure] = caption
         return super().figure(figure, caption, alt=alt, chart=chart)
 
     def turning(
         self, widget: Any, payload: bytes, poster: Image, caption: str, *, label: str, still: str
     ) -> Turning | Figure:
-        """Return the still of something that turns; it has no bytes if it is the drawing that was kept last."""
+        """Return the still picture of a widget; it has no bytes if it is the drawing that was recorded last."""
         if not poster.data:
             self.captions[self.drawn[-1][-1]] = caption
         self.step(caption)
@@ -235,7 +233,9 @@ class _FigureFiles(Page):
             name = anchor(heading)
             repeats = named[name] > 1 and chapter != heading
             base = f"{anchor(chapter)[:_LONGEST]}-{name[:_LONGEST]}" if repeats else name[:_LONGEST]
-            name = next(one for one in chain([base], (f"{base}-{k}" for k in count(2))) if one not in taken)
+            name = next(
+                candidate for candidate in chain([base], (f"{base}-{k}" for k in count(2))) if candidate not in taken
+            )
             taken.add(name)
             self.paths += figures.save_figure(drawing, self.output / name, self.config.formats, self.config.dpi)
             captions.append(f"{name}: {heading}. {self.captions.get(drawing, '')}".strip())
@@ -249,7 +249,7 @@ def write_figures(
     """Write the figures of the report of `folder` to `figures` in it, with captions.txt.
 
     Args:
-        folder: of any results that `write_report` reports.
+        folder: folder of results of any kind that `write_report` reports.
         config: formats, resolution and views.
         model: file of the model of fits; None for that of their records.
         on_step: called after each figure.
@@ -260,7 +260,7 @@ def write_figures(
     Raises:
         FileError: the folder cannot be read or written.
         FileFormatError: the results or the orientation are damaged.
-        InputError: the folder holds no results, or a view that there is not.
+        InputError: the folder contains no results, or a view does not exist.
         ShapespaceError: the extra `report` is not installed.
     """
     require_report_extra()

@@ -21,13 +21,13 @@ Colour: TypeAlias = tuple[float, float, float]
 """Red, green, blue in [0, 1], sRGB."""
 
 CLAY: Colour = (0.80, 0.755, 0.715)
-"""A surface of which only the form is to be seen."""
+"""Colour of a surface without a map."""
 # orange; colours of this group are sRGB from 0 to 1, and differ in lightness too
 SCAN_COLOUR: Colour = (0.93, 0.66, 0.36)
 MODEL_COLOUR: Colour = (0.36, 0.58, 0.80)  # blue
 DENSE_COLOUR: Colour = (0.33, 0.66, 0.56)  # green
 UNKNOWN_COLOUR: Colour = (0.66, 0.66, 0.66)
-"""Where a map has no value."""
+"""Colour of vertices without a value."""
 WITHIN_COLOUR: Colour = (0.22, 0.53, 0.74)  # blue
 BEYOND_COLOUR: Colour = (0.95, 0.58, 0.20)
 """The two sides of a threshold."""
@@ -40,7 +40,7 @@ REGION_COLOURS: Mapping[str, Colour] = MappingProxyType(
         "unseen": (0.80, 0.80, 0.80),
     }
 )
-"""What the fit made of each part of the model, by the names of `shapespace.report.inputs.saved_fits.REGIONS`."""
+"""Colours of the regions of the model in a fit, by the names of `shapespace.report.inputs.saved_fits.REGIONS`."""
 
 # Okabe and Ito's colours, with a dark red in place of the yellow that white paper swallows.
 CATEGORIES: tuple[Colour, ...] = (
@@ -82,10 +82,10 @@ def _srgb(lab: FloatArray) -> FloatArray:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
-def _even(anchors: npt.ArrayLike, count: int) -> FloatArray:
+def _even_steps(anchors: npt.ArrayLike, count: int) -> FloatArray:
     """Return `count` colours (count, 3) of sRGB along `anchors` (n, 3) of OKLab, at equal steps to the eye."""
     anchors = np.asarray(anchors, dtype=np.float64)
-    curve = _between(np.linspace(0, len(anchors) - 1, 2001), np.arange(len(anchors)), anchors)
+    curve = _interpolate(np.linspace(0, len(anchors) - 1, 2001), np.arange(len(anchors)), anchors)
     # Corners in a map are seen as edges that the data do not have.
     n_steps = 150
     padded = np.concatenate([2 * curve[0] - curve[n_steps:0:-1], curve, 2 * curve[-1] - curve[-2 : -n_steps - 2 : -1]])
@@ -93,10 +93,10 @@ def _even(anchors: npt.ArrayLike, count: int) -> FloatArray:
     for k in range(3):
         curve[:, k] = np.convolve(padded[:, k], window, mode="valid")
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
-    return _srgb(_between(np.linspace(0, float(along[-1]), count), along, curve))
+    return _srgb(_interpolate(np.linspace(0, float(along[-1]), count), along, curve))
 
 
-def _between(positions: npt.NDArray[Any], known: npt.NDArray[Any], colours: FloatArray) -> FloatArray:
+def _interpolate(positions: npt.NDArray[Any], known: npt.NDArray[Any], colours: FloatArray) -> FloatArray:
     return np.stack([np.interp(positions, known, colours[:, k]) for k in range(3)], axis=1)
 
 
@@ -107,7 +107,7 @@ def _diverging() -> FloatArray:
     )
     # Equal distances from zero must look equally far, so both arms get the mean lightness of the two.
     cold[:, 0] = warm[:, 0] = (cold[:, 0] + warm[:, 0]) / 2
-    arms = [_even(np.concatenate([middle, arm]), 128) for arm in (cold, warm)]
+    arms = [_even_steps(np.concatenate([middle, arm]), 128) for arm in (cold, warm)]
     return read_only(np.concatenate([arms[0][::-1], arms[1]]))
 
 
@@ -116,7 +116,7 @@ def _hex(text: str) -> list[float]:
 
 
 _PALE_TO_DARK = ("f6f1e4", "f3cf8e", "e98f53", "c24a5c", "7a2669", "2b1250")
-SEQUENTIAL = read_only(_even(oklab([_hex(name) for name in _PALE_TO_DARK]), 256))
+SEQUENTIAL = read_only(_even_steps(oklab([_hex(name) for name in _PALE_TO_DARK]), 256))
 """(256, 3) float64, sRGB in [0, 1]: pale for small, dark for large."""
 DIVERGING = _diverging()
 """(256, 3) float64, sRGB in [0, 1]: blue for negative, pale for zero, red for positive."""
@@ -131,7 +131,7 @@ def as_list(colours: FloatArray, n: int = 64) -> list[list[float]]:
     colours = np.asarray(colours, dtype=np.float64)
     if n < 2 or colours.ndim != 2 or colours.shape[1] != 3:
         raise InputError(f"A colour map must have the shape (N, 3), not {colours.shape}, and n be 2 or more, not {n}.")
-    return np.round(_between(np.linspace(0, len(colours) - 1, n), np.arange(len(colours)), colours), 4).tolist()
+    return np.round(_interpolate(np.linspace(0, len(colours) - 1, n), np.arange(len(colours)), colours), 4).tolist()
 
 
 def as_hex(colour: Colour) -> str:

@@ -1,6 +1,6 @@
 """Renderer of meshes and point clouds by a z-buffer: no GPU, no window, reproducible to the byte.
 
-The nearest triangle of each pixel is found first; normals and scalars are interpolated for what is seen only.
+The nearest triangle of each pixel is found first; normals and scalars are interpolated only where they are visible.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ class Camera:
 
     Args:
         centre: (3,) point in the middle of the picture, mm.
-        height_mm: height of what the picture shows at the centre's depth.
-        yaw_deg: the object turns this far to the picture's right.
-        pitch_deg: the object's front tilts this far down.
-        distance_mm: from the eye to the centre; None for an orthographic picture.
+        height_mm: height of the visible area at the depth of the centre, mm.
+        yaw_deg: rotation of the object to the picture's right, degrees.
+        pitch_deg: downward tilt of the object's front, degrees.
+        distance_mm: distance of the eye from the centre, mm; None for an orthographic picture.
 
     Raises:
         InputError: a height or distance that is not positive.
@@ -110,16 +110,16 @@ class Layer:
 
     Args:
         mesh: vertices in mm; without faces each vertex is drawn as a small ball.
-        colour: used where there are no scalars.
-        scalars: (V,) float64, one a vertex; values that are not finite are drawn in grey.
+        colour: colour of a layer without scalars.
+        scalars: (V,) float64, one per vertex; values that are not finite are drawn in grey.
         colormap: (N, 3) colours from `vmin` to `vmax`; few colours give bands with sharp edges.
         vmin: scalar of the first colour.
         vmax: scalar of the last colour.
-        point_radius_mm: radius of the balls of a point cloud; None takes one by their spacing, and shades them as the
+        point_radius_mm: radius of the balls of a point cloud; None derives it from the spacing and shades them as the
             surface that they lie on.
-        categories: the scalars are codes: a pixel takes that of most of its triangle, and nothing between two of them.
-        across: (V,) float64, a second scalar: the surface is then a checkerboard of squares from one whole number of
-            each scalar to the next. The first colour is that of every other square, the others take turns.
+        categories: whether the scalars are codes: a pixel has the code of most of its triangle, not a mean.
+        across: (V,) float64, second scalar: the surface is then a checkerboard of squares between consecutive integers
+            of each scalar. The first colour is that of every other square, the others take turns.
 
     Raises:
         InputError: scalars without a map, of another length, or an empty range.
@@ -159,9 +159,9 @@ def distance_layer(mesh: Mesh, distances_mm: FloatArray, limit_mm: float, *, sig
 
     Args:
         mesh: the surface or points.
-        distances_mm: (V,) signed; not-a-number is drawn in grey.
-        limit_mm: positive.
-        signed: whether the signs mean something, which distances to a point cloud's do not.
+        distances_mm: (V,) signed distances, mm; NaN is drawn in grey.
+        limit_mm: end of the scale, mm; positive.
+        signed: whether the signs have a meaning; those of distances to a point cloud have none.
     """
     if signed:
         return Layer(mesh, scalars=distances_mm, colormap=DIVERGING, vmin=-limit_mm, vmax=limit_mm)
@@ -175,7 +175,7 @@ class _Surfels:
     pixel: npt.NDArray[np.int64]
     depth_mm: _Single
     normal: _Single  # (3, n), as seen from the eye
-    scalar: _Single  # (n,), or (0,) where the layer has none
+    scalar: _Single  # (n,), or (0,) if the layer has no scalars
     back: npt.NDArray[np.bool_]
     occlusion: _Single
 
@@ -186,8 +186,8 @@ def render(
     """Render layers on white, the nearest layer in each pixel.
 
     Args:
-        layers: what to draw.
-        camera: where from.
+        layers: layers to draw.
+        camera: camera of the picture.
         size: (width, height) in pixels.
         supersample: samples per pixel and axis.
 
@@ -195,7 +195,7 @@ def render(
         (height, width, 3) uint8.
 
     Raises:
-        InputError: a size or supersample that is not a small positive whole number.
+        InputError: a size or supersample that is not a small positive integer.
     """
     return render_series([layers], camera=camera, size=size, supersample=supersample)[0]
 
@@ -220,7 +220,7 @@ def render_series(
     surfels_by_key: dict[tuple[object, ...], _Surfels] = {}
     pieces: dict[int, tuple[_Single, _Surfels]] = {}
     for layer in {id(layer): layer for layers in pictures for layer in layers}.values():
-        # Layers hold views of their scalars: those of one array begin at one place.
+        # Layers have views of their scalars; all views of an array have one address.
         scalars = None if layer.scalars is None else layer.scalars.ctypes.data
         cache_key = (
             id(layer.mesh),
@@ -231,11 +231,11 @@ def render_series(
         )
         if cache_key not in surfels_by_key:
             surfels_by_key[cache_key] = _surfels(layer, camera, fine, supersample)
-        pieces[id(layer)] = (_shaded(layer, surfels_by_key[cache_key]), surfels_by_key[cache_key])
-    return [_composed([pieces[id(layer)] for layer in layers], size, supersample) for layers in pictures]
+        pieces[id(layer)] = (_shade(layer, surfels_by_key[cache_key]), surfels_by_key[cache_key])
+    return [_compose_layers([pieces[id(layer)] for layer in layers], size, supersample) for layers in pictures]
 
 
-def _composed(pieces: Sequence[tuple[_Single, _Surfels]], size: tuple[int, int], supersample: int) -> Image:
+def _compose_layers(pieces: Sequence[tuple[_Single, _Surfels]], size: tuple[int, int], supersample: int) -> Image:
     """Return the nearest of shaded layers in each sample, averaged over those of each pixel, as sRGB."""
     width, height = size
     count = width * height * supersample**2
@@ -251,13 +251,13 @@ def visible_triangles(mesh: Mesh, *, camera: Camera, size: tuple[int, int]) -> t
     """Return the triangle that each pixel shows, and its depth.
 
     Args:
-        mesh: with faces.
-        camera: where from.
+        mesh: mesh with faces.
+        camera: camera of the picture.
         size: (width, height) in pixels.
 
     Returns:
-        (H, W) int32 index of the nearest triangle at the pixel's centre, -1 where there is none, and (H, W)
-        float64 depth, growing away from the eye (infinite where there is none). Its unit is mm for an
+        (H, W) int32 index of the nearest triangle at the pixel's centre, -1 without a triangle, and (H, W)
+        float64 depth, growing away from the eye (infinite without a triangle). Its unit is mm for an
         orthographic camera; in perspective it is -1/mm.
     """
     screen, depth = _project(mesh.vertices, camera, size)
@@ -351,15 +351,15 @@ def squares(along: npt.NDArray[np.floating[Any]], across: npt.NDArray[np.floatin
     Those nearest to each other differ, also two columns or rows apart, so that neighbouring squares are visible.
 
     Args:
-        along: (n,) where the points lie in one direction, a square being 1 wide.
-        across: (n,) and in the other.
+        along: (n,) positions in one direction, in widths of a square.
+        across: (n,) positions in the other direction, in widths of a square.
     """
     column, row = np.floor(along).astype(np.int64), np.floor(across).astype(np.int64)
     turn = (3 * column - row) // 2 % SQUARE_COLOURS
     return np.where((column + row) % 2 == 0, 1 + turn, 0).astype(np.float32)
 
 
-def _unit(vectors: _Single) -> _Single:
+def _normalise(vectors: _Single) -> _Single:
     """Return (d, n) vectors normalised to length one."""
     squares = vectors[0] ** 2 + vectors[1] ** 2 + vectors[2] ** 2
     return vectors / np.sqrt(np.maximum(squares, 1e-24))
@@ -375,7 +375,7 @@ def _balls(layer: Layer, camera: Camera, size: tuple[int, int], supersample: int
     behind = _depth_mm(depth, camera)
     radius = max(radius_mm * height / camera.height_mm, 0.75)
     winner, nearest = np.empty(width * height, dtype=np.int32), np.empty(width * height)
-    # Those of a surface are flattened, so that their rounding does not stand out of it.
+    # Balls of a surface are flattened, so that they do not rise above the surface.
     rise_mm = radius_mm if surface is None else 0.3 * radius_mm
     nearest_balls(screen, behind, radius, rise_mm, width, height, winner, nearest)
     pixel = np.flatnonzero(winner >= 0)
@@ -388,7 +388,7 @@ def _balls(layer: Layer, camera: Camera, size: tuple[int, int], supersample: int
         view_directions = (surface @ _view_axes(camera.yaw_deg, camera.pitch_deg).T).astype(np.float32)
         view_directions *= np.where(view_directions[:, 2:] < 0, np.float32(-1), np.float32(1))
         # A little of the ball is kept, which distinguishes a cloud from a closed surface.
-        normal = np.ascontiguousarray(_unit((view_directions[owner].T + 0.35 * normal).astype(np.float32)))
+        normal = np.ascontiguousarray(_normalise((view_directions[owner].T + 0.35 * normal).astype(np.float32)))
     scalar = (np.zeros(0) if layer.scalars is None else layer.scalars[owner]).astype(np.float32)
     depth_mm = nearest[pixel].astype(np.float32)
     is_back = np.zeros(len(pixel), dtype=np.bool_)
@@ -435,7 +435,7 @@ def _linear(colours: npt.ArrayLike) -> _Single:
     return (np.atleast_2d(np.asarray(colours, dtype=np.float64)) ** _GAMMA).astype(np.float32)
 
 
-def _shaded(layer: Layer, surfels: _Surfels) -> _Single:
+def _shade(layer: Layer, surfels: _Surfels) -> _Single:
     """Return linear colours (n, 3)."""
     out = np.empty((len(surfels.pixel), 3), dtype=np.float32)
     shade_pixels(
@@ -498,8 +498,8 @@ def nearest_triangles(
         screen: (V, 2) pixels, y down; not-a-number drops the triangles of a vertex.
         depth: (V,) linear across a triangle on the screen, growing away from the eye.
         faces: (F, 3).
-        width: of the picture in pixels.
-        height: of the picture in pixels.
+        width: width of the picture, pixels.
+        height: height of the picture, pixels.
         triangle: (height * width,), written.
         nearest: (height * width,), written.
     """
@@ -574,14 +574,14 @@ def interpolate(
 
     Args:
         pixel: (n,) covered pixels, row by row.
-        triangle_index: (n,) the triangle of each.
+        triangle_index: (n,) index of the triangle of each pixel.
         screen: (V, 2) pixels.
-        nearness: (V,) one over the distance from the eye, or one where the picture is orthographic.
+        nearness: (V,) one over the distance from the eye, or one for an orthographic camera.
         faces: (F, 3).
         normals: (V, 3) unit normals as seen from the eye.
         scalars: (V,), or (0,) for none.
         categories: whether scalars are codes, of which the one with the largest share is taken.
-        width: of the picture in pixels.
+        width: width of the picture, pixels.
         normal: (3, n), written: of unit length, towards the eye.
         scalar: (n,) or (0,), written.
         is_back: (n,), written: whether the triangle is seen from behind.
@@ -637,11 +637,11 @@ def nearest_balls(
 
     Args:
         screen: (V, 2) pixels, y down; not-a-number drops a ball.
-        depth_mm: (V,) of the balls' centres.
-        radius: of the balls in pixels.
-        rise_mm: how far a ball stands out before its centre, mm.
-        width: of the picture in pixels.
-        height: of the picture in pixels.
+        depth_mm: (V,) depth of the balls' centres.
+        radius: radius of the balls, pixels.
+        rise_mm: distance of the front of a ball from its centre, mm.
+        width: width of the picture, pixels.
+        height: height of the picture, pixels.
         ball: (height * width,), written.
         nearest: (height * width,), written.
     """

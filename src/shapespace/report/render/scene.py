@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 _DTYPES = ("float32", "int32", "uint32", "uint16", "int16", "uint8")
 _UNKNOWN = -32768  # smallest int16
 _MOST_STEPS = 32767  # largest int16
-# What a report rounds to: an error of 0.02 mm is a hundredth of what a good fit leaves.
+# Rounding in a report: an error of 0.02 mm is a hundredth of the residual of a good fit.
 _PLACE_STEP_MM = 0.04
 _DISTANCE_STEP_MM = 0.05  # mm
 _MODE_STEP_MM = 0.02  # mm
@@ -47,7 +47,7 @@ class Steps:
     """An array of 16-bit integers, perhaps times a scale, for `pack`.
 
     Args:
-        values: int16 or uint16, any shape; -32768 stands for NaN where there is a scale.
+        values: int16 or uint16, any shape; -32768 stands for NaN if there is a scale.
         scale: one positive number, one for each leading row, or None for integers that are what they are.
         coded: store differences from row to row, byte by byte, which deflate makes small where neighbours are alike.
         follows: name of an array packed before, of the same shape and scale; differences from it are coded.
@@ -91,10 +91,10 @@ def pack(arrays: Mapping[str, npt.NDArray[Any] | Steps], facts: Mapping[str, Any
     Args:
         arrays: name -> array; float64 becomes float32, int64 int32 and bool uint8, other types must be float32, int32,
             uint32, uint16, int16 or uint8, or `Steps`.
-        facts: anything JSON can hold; numbers that are not finite become null.
+        facts: any content of JSON; numbers that are not finite become null.
 
     Raises:
-        InputError: an array of another type, or facts that JSON cannot hold.
+        InputError: an array of another type, or facts that JSON cannot represent.
     """
     specs: dict[str, Any] = {}
     buffers: list[bytes] = []
@@ -109,18 +109,18 @@ def pack(arrays: Mapping[str, npt.NDArray[Any] | Steps], facts: Mapping[str, Any
             if values.coded:
                 reference = arrays[values.follows] if values.follows is not None else None
                 spec["coded"] = values.follows or True
-                data = _coded(array, reference.values if isinstance(reference, Steps) else None)
+                data = _encode_differences(array, reference.values if isinstance(reference, Steps) else None)
         specs[name] = spec
         buffers.append(data + bytes(-len(data) % 8))
         offset += len(buffers[-1])
     try:
         header = json.dumps({"facts": to_json(facts), "arrays": specs}, allow_nan=False).encode("ascii")
     except (TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"The facts of a scene must be plain values that JSON can hold ({error}).") from error
+        raise InputError(f"The facts of a scene must be plain values that JSON can represent ({error}).") from error
     return struct.pack("<I", len(header)) + header + bytes(-(4 + len(header)) % 8) + b"".join(buffers)
 
 
-def _coded(array: npt.NDArray[Any], reference: npt.NDArray[Any] | None) -> bytes:
+def _encode_differences(array: npt.NDArray[Any], reference: npt.NDArray[Any] | None) -> bytes:
     """Return the differences from row to row modulo 2^16, small ones of both signs as small numbers, by byte planes."""
     columns = array.shape[-1] if array.ndim > 1 else 1
     values = array.reshape(-1, columns).view(np.uint16)
@@ -144,8 +144,8 @@ def pack_model(model: ShapeModel, modes: int | None = None, *, small: bool = Fal
 
     Args:
         model: any model.
-        modes: how many of its modes; None takes all, and a number above them is cut to them.
-        small: for a report: rounded to 0.02 mm, and vertices and triangles in another order, which deflates well.
+        modes: number of modes, at most that of the model; None for all.
+        small: whether to reduce the size for a report: rounded to 0.02 mm, with vertices reordered to deflate well.
 
     Raises:
         InputError: fewer than one mode.
@@ -199,13 +199,13 @@ def pack_morph(
     Arrays: `mean` (V, 3) mm; `faces`, absent for points; `modes` (q, V, 3) mm, of a line half of the difference.
 
     Args:
-        low: where the slider begins.
-        high: in correspondence with it; where the slider ends.
-        labels: what they are.
+        low: shape at the start of the slider.
+        high: shape at the end of the slider, in correspondence with `low`.
+        labels: names of the two shapes.
         path: modes (q, V, 3) mm and weights (B, q) of the shapes low + weights modes; None for a line.
-        variable: that the slider shows; empty for none.
-        ends: its values at `low` and `high`.
-        largest: how many triangles (or points) are kept.
+        variable: name of the variable of the slider; empty for none.
+        ends: values of the variable at `low` and `high`.
+        largest: largest number of triangles (or points).
     """
     half = (high.vertices - low.vertices) / 2
     modes, weights = (half[None], np.array([[-1.0], [1.0]])) if path is None else path
@@ -235,7 +235,7 @@ def pack_morphospace(space: Morphospace, *, largest: int = 12_000) -> bytes:
 
     Args:
         space: the plot.
-        largest: how many triangles of a surface are kept.
+        largest: largest number of triangles of a surface.
     """
     part, given, rows = space.part, dict(space.arrays), np.arange(len(space.arrays["mean"]))
     mesh = Mesh(given.pop("mean"), space.faces)
@@ -280,10 +280,10 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: i
     and `history_rms_mm` (n,). The fact `scale_mm` is the end of the one colour scale of this fit.
 
     Args:
-        staged: a fit with its stages.
-        largest_scan: for a report: scan and model are thinned to at most this many triangles (or points) each, rounded
-            to 0.02 mm, their vertices put in another order, and the iterations left out. None packs all as it is.
-        most_sent: without `largest_scan`: the scan alone is thinned to at most this many triangles (or points).
+        staged: fit with its stages.
+        largest_scan: limit for a report: scan and model are thinned to at most this many triangles (or points) each,
+            rounded to 0.02 mm, their vertices put in another order, and the iterations omitted. None packs all data.
+        most_sent: limit without `largest_scan`: only the scan is thinned to at most this many triangles (or points).
 
     Raises:
         InputError: `largest_scan` or `most_sent` below 1.
@@ -342,12 +342,12 @@ def pack_surfaces(
     """Return the data for the widget of a fit without its scan: as `pack_fit`, without scan and distances.
 
     Args:
-        surfaces: `final`, and `dense` where there is one, with the same triangles, in the picture frame.
-        record: of the fit.
-        name: of the fit.
-        label: what pictures call it.
-        reason: there is no scan to show, as the end of a sentence.
-        largest: for a report: how many triangles (or points) are kept; None packs all as it is.
+        surfaces: `final`, and `dense` if there is one, with the same triangles, in the picture frame.
+        record: record of the fit.
+        name: name of the fit.
+        label: label in pictures.
+        reason: reason why the scan is not shown, as the end of a sentence.
+        largest: largest number of triangles (or points) in a report; None packs all as it is.
     """
     last = list(surfaces.values())[-1]
     model, source_rows = (last, np.arange(len(last.vertices))) if largest is None else _decimate(last, largest)
@@ -372,7 +372,7 @@ def pack_surfaces(
 def _stage_arrays(
     staged: StagedFit, of_model: npt.NDArray[np.intp], of_scan: npt.NDArray[np.intp], *, small: bool
 ) -> dict[str, npt.NDArray[Any] | Steps]:
-    """Return surface and distances at each stage, of these vertices and scan points; shares are of all of them."""
+    """Return surface and distances at each stage, for some vertices and scan points; shares are those of all."""
     surfaces = {f"surface_{stage}": surface.vertices[of_model] for stage, surface in staged.surfaces.items()}
     arrays: dict[str, npt.NDArray[Any] | Steps] = {}
     arrays |= _shared_steps(surfaces) if small else {name: _places(values, small) for name, values in surfaces.items()}
@@ -422,13 +422,13 @@ def pack_scatter(
 
     Args:
         points: (n, K) coefficients, K at least 1.
-        labels: n labels, which give the colours.
+        labels: n labels, which select the colours.
         names: n names.
         axes: K names of the coefficients.
-        unit: of the coefficients, in words.
+        unit: unit of the coefficients, in words.
 
     Raises:
-        InputError: lengths that do not go together.
+        InputError: lengths that do not match.
     """
     points = np.asarray(points, dtype=np.float64)
     if (
@@ -479,8 +479,8 @@ def payload_html(identifier: str, payload: bytes) -> str:
     """Return `payload` as a script element of a type that browsers keep but never run: deflated, in base64.
 
     Args:
-        identifier: its id, escaped here; widgets are given the element or this id.
-        payload: from `pack`.
+        identifier: id of the element, escaped here; widgets are given the element or this id.
+        payload: bytes from `pack`.
     """
     text = base64.b64encode(zlib.compress(payload, 9)).decode("ascii")
     mark = escape(identifier, quote=True)
@@ -491,7 +491,7 @@ def _portable(name: str, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
     target_dtype = {"float64": np.float32, "int64": np.int32, "bool": np.uint8}.get(array.dtype.name)
     if target_dtype is not None:
         if array.dtype == np.int64 and array.size and np.abs(array).max() > np.iinfo(np.int32).max:
-            raise InputError(f"The array {name!r} holds integers beyond 32 bits, which scenes do not have.")
+            raise InputError(f"The array {name!r} contains integers beyond 32 bits, which scenes do not have.")
         array = array.astype(target_dtype)
     if array.dtype.name not in _DTYPES:
         raise InputError(f"The array {name!r} has the type {array.dtype}; scenes have {', '.join(_DTYPES)}.")
@@ -499,7 +499,7 @@ def _portable(name: str, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def _indices(name: str, faces: IntArray | None, vertices: int, *, coded: bool) -> dict[str, npt.NDArray[Any] | Steps]:
-    """Return the triangles of a surface by their name; none of points."""
+    """Return the triangles of a surface by their name; nothing for points."""
     if faces is None:
         return {}
     return {name: faces.astype(np.uint32) if vertices > 1 << 16 else Steps(faces.astype(np.uint16), coded=coded)}
@@ -573,13 +573,13 @@ _MOST_COLLAPSED = 150_000  # triangles; larger scans are clustered on a grid fir
 def decimate(scan: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
     """Return `scan` with at most `largest` triangles (or points), and the indices of the remaining vertices.
 
-    No new point is made, so what was measured at a vertex stays true of it. Of surfaces, the shortest edges are
+    No new point is made, so values measured at a vertex remain valid. Of surfaces, the shortest edges are
     collapsed. Points, surfaces that branch, and very large ones, which would take long, are thinned by a cubic grid
     instead (Rossignac and Borrel 1993): of each cell the vertex nearest to the mean stays.
 
     Args:
         scan: any surface or points.
-        largest: at least 1.
+        largest: largest number of triangles or points, at least 1.
 
     Returns:
         The mesh, and (S',) indices into the vertices of `scan`.
@@ -587,14 +587,14 @@ def decimate(scan: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
     if _count(scan) <= largest:
         return scan, np.arange(len(scan.vertices))
     if scan.faces is not None and len(scan.faces) <= _MOST_COLLAPSED:
-        collapsed = _collapsed(scan, scan.faces, largest)
+        collapsed = _collapse_edges(scan, scan.faces, largest)
         if collapsed is not None:
             return collapsed
     cell = float(np.ptp(scan.vertices, axis=0).max()) / math.sqrt(largest)
     best: tuple[Mesh, npt.NDArray[np.intp]] | None = None
     # Of a surface, what is left goes with the inverse square of the cell, so a few steps come close to `largest`.
     for _ in range(8):
-        trial = _clustered(scan, cell)
+        trial = _cluster_on_grid(scan, cell)
         left = _count(trial[0])
         if left <= largest and (best is None or left > _count(best[0])):
             best = trial
@@ -603,12 +603,12 @@ def decimate(scan: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:
         cell *= math.sqrt(max(left, 1) / (0.95 * largest))
     while best is None:
         cell *= 2.0
-        trial = _clustered(scan, cell)
+        trial = _cluster_on_grid(scan, cell)
         best = trial if _count(trial[0]) <= largest else None
     return best
 
 
-def _collapsed(scan: Mesh, faces: IntArray, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]] | None:
+def _collapse_edges(scan: Mesh, faces: IntArray, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]] | None:
     """Return the surface after edge collapse and its remaining vertices; None for a non-manifold surface."""
     try:
         _, triangles, source_rows = collapse(scan.vertices, faces, largest, scan.name)
@@ -623,7 +623,7 @@ def _count(mesh: Mesh) -> int:
     return len(mesh.vertices) if mesh.faces is None else len(mesh.faces)
 
 
-def _clustered(scan: Mesh, cell: float) -> tuple[Mesh, npt.NDArray[np.intp]]:
+def _cluster_on_grid(scan: Mesh, cell: float) -> tuple[Mesh, npt.NDArray[np.intp]]:
     points = scan.vertices
     cells = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
     side = cells.max(axis=0) + 1

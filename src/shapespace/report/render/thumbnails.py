@@ -29,7 +29,7 @@ PANEL = (176, 232)
 """Width and height of a panel in pixels."""
 
 AREA_LIMIT = 2.0
-"""The factor of growth at which the maps of change of area end."""
+"""End of the maps of area change, as a factor of growth."""
 FOLD_COLOUR: Colour = (0.05, 0.05, 0.05)  # near black, sRGB from 0 to 1
 
 Still: TypeAlias = tuple[bytes, tuple[int, int]]
@@ -43,8 +43,8 @@ def fit_strip(fit: StagedFit, limit_mm: float, panel: tuple[int, int] = PANEL) -
     `colours.SEQUENTIAL` from 0. Vertices that the scan does not show are grey.
 
     Args:
-        fit: with its stages.
-        limit_mm: where the scale of the distances ends.
+        fit: fit with its stages.
+        limit_mm: end of the scale of the distances, mm.
         panel: width and height of each panel in pixels.
     """
     surface = fit.surfaces["final"]
@@ -70,10 +70,10 @@ def correspondence_strip(
 
     Args:
         mean: the mean shape, upright.
-        vertices: (V, 3) of the surface, moved onto the mean shape; not-a-number where missing.
-        scan: the raw scan moved likewise; None leaves out its panel and that of the distances.
-        distance: (V,) of the vertices from the scan, not-a-number where unknown; not used without a scan.
-        limit: where the scale of the distances ends.
+        vertices: (V, 3) vertices of the surface, moved onto the mean shape; NaN where missing.
+        scan: raw scan, moved likewise; None omits its panel and that of the distances.
+        distance: (V,) distances of the vertices from the scan, NaN where unknown; not used without a scan.
+        limit: end of the scale of the distances, in the unit of `distance`.
         panel: width and height of each panel in pixels.
     """
     surface = mean.with_vertices(vertices)
@@ -142,13 +142,13 @@ SQUARES = np.stack([_PAPER, *(0.62 * np.array(colour) + 0.38 * _PAPER for colour
 
 
 def checker_places(mean: Mesh, yaw_deg: float = 0.0) -> tuple[FloatArray, FloatArray]:
-    """Return where on a checkerboard each vertex of `mean` lies, two of (V,), so that a square is 1 by 1.
+    """Return the position (V,), (V,) of each vertex of `mean` on a checkerboard whose squares are 1 by 1.
 
-    The board stands before the mean shape and is thrown onto it; its middle is that of the shape.
+    The board lies in front of the mean shape and is projected onto it; its middle is that of the shape.
 
     Args:
-        mean: the surface, upright.
-        yaw_deg: from where it is thrown: 0 from the front, 90 from the side that a camera of that angle sees.
+        mean: mean shape, upright.
+        yaw_deg: direction, degrees: 0 from the front, 90 from the side that a camera of that angle sees.
 
     Raises:
         InputError: the shape has no extent.
@@ -166,7 +166,7 @@ def checker_places(mean: Mesh, yaw_deg: float = 0.0) -> tuple[FloatArray, FloatA
 
 
 def checker_layer(surface: Mesh, places: tuple[FloatArray, FloatArray]) -> Layer:
-    """Return `surface` under the checkerboard that lies at `places`, two of (V,); missing vertices are left out."""
+    """Return `surface` under the checkerboard that lies at `places`, two arrays (V,); missing vertices are omitted."""
     drawn_surface, along = drawable(surface, places[0])
     _, across = drawable(surface, places[1])
     return Layer(drawn_surface, scalars=along, across=across, colormap=SQUARES, vmin=-0.5, vmax=len(SQUARES) - 0.5)

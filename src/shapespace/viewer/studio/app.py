@@ -60,11 +60,11 @@ class OpenProject:
     """A project that is open: the owner of its locks, jobs, checks and pages.
 
     Args:
-        folder: of the project.
-        create: whether it is new.
-        changed: called when anything changed.
+        folder: folder of the project.
+        create: whether to create the project.
+        changed: function that is called after each change.
         upload_bytes: size limit of a scan.
-        read_only: nothing is written into the folder, in which a studio may run.
+        read_only: whether nothing is written into the folder, in which a studio may run.
     """
 
     def __init__(
@@ -81,23 +81,26 @@ class OpenProject:
             self._resources.callback(resource.close)
 
     def close(self) -> None:
-        """Let go of the project; a running job goes on."""
+        """Close the project; a running job continues."""
         self._resources.close()
 
     def _result(self, number: int) -> Path | None:
-        """Return the path of the result of a job; None where it has none."""
-        job = next((one for one in self.jobs.all() if one.number == number and one.status == "done"), None)
+        """Return the path of the result of a job; None if it has none."""
+        job = next((job for job in self.jobs.all() if job.number == number and job.status == "done"), None)
         return None if job is None else result_path(self.project.folder, job.output)
 
     def facts(self) -> dict[str, Any]:
         """Return the state for the page."""
         project, state = self.project, self.project.state
         specimens: list[dict[str, Any]] = []
-        for one in state.specimens:
-            facts = self.checks.facts(project.path(one)) or {"state": "waiting", "vertices": 0, "triangles": 0,
-                                                             "extent": 0.0, "findings": []}  # fmt: skip
-            specimens.append({"id": one.id, "file": one.file, "set": one.role, "included": one.included,
-                              "unit": one.unit, "mirrored": one.mirrored, "cells": one.cells, **facts})  # fmt: skip
+        for specimen in state.specimens:
+            facts = self.checks.facts(project.path(specimen)) or {
+                "state": "waiting", "vertices": 0, "triangles": 0, "extent": 0.0, "findings": []
+            }  # fmt: skip
+            specimens.append({
+                "id": specimen.id, "file": specimen.file, "set": specimen.role, "included": specimen.included,
+                "unit": specimen.unit, "mirrored": specimen.mirrored, "cells": specimen.cells, **facts,
+            })  # fmt: skip
         return {
             "name": state.name, "folder": str(project.folder), "revision": project.revision,
             "columns": list(state.columns), "specimens": specimens, "notes": state.notes(), "counts": state.counts(),
@@ -124,7 +127,7 @@ class OpenProject:
 
 
 def _words(folder: Path) -> tuple[list[str], str | None]:
-    """Return the sentences and the methods paragraph of an analysis; none where the result is no analysis."""
+    """Return the sentences and the methods paragraph of an analysis; none if the result is no analysis."""
     analysis = folder / "analysis.json"
     return _read_words(analysis, analysis.stat().st_mtime_ns) if analysis.is_file() else ([], None)
 
@@ -146,10 +149,10 @@ class Studio:
     """The endpoints of the studio, and the owner of the project that is open.
 
     Args:
-        forms: of the commands.
-        folder: of the project to open; None for the start page.
+        forms: forms of the commands.
+        folder: folder of the project to open; None for the start page.
         upload_bytes: size limit of a scan.
-        read_only: show the project, and refuse edits and jobs.
+        read_only: whether to only show the project, and reject edits and jobs.
     """
 
     def __init__(self, forms: Forms, folder: Path | None, upload_bytes: int, *, read_only: bool = False) -> None:
@@ -196,14 +199,14 @@ class Studio:
         ]
         if self._read_only:
             routes = [
-                one if isinstance(one, Mount) or "GET" in (one.methods or ())
-                else Route(one.path, _refuse_change, methods=list(one.methods or ()))
-                for one in routes
+                route if isinstance(route, Mount) or "GET" in (route.methods or ())
+                else Route(route.path, _reject_change, methods=list(route.methods or ()))
+                for route in routes
             ]  # fmt: skip
         return application(routes, str)
 
     def close(self) -> None:
-        """Let go of the project."""
+        """Close the project."""
         with self._lock:
             if self._open is not None:
                 self._open.close()
@@ -276,9 +279,9 @@ class Studio:
     def _folders(self, request: Request) -> Response:
         path = _place(request.query_params.get("path") or str(Path.home()))
         try:
-            entries = sorted(path.iterdir(), key=lambda one: one.name.casefold())
-            names = [one.name for one in entries if one.is_dir() and not one.name.startswith(".")]
-            scans = sum(one.name.lower().endswith(MESH_FILE_ENDINGS) for one in entries)
+            entries = sorted(path.iterdir(), key=lambda entry: entry.name.casefold())
+            names = [entry.name for entry in entries if entry.is_dir() and not entry.name.startswith(".")]
+            scans = sum(entry.name.lower().endswith(MESH_FILE_ENDINGS) for entry in entries)
         except OSError as error:
             raise FileError(f"Cannot read {path}: {error.strerror or error}.") from error
         return json_response(
@@ -314,25 +317,25 @@ class Studio:
 
     def _thumbnail(self, request: Request) -> Response:
         opened, wanted = self._project, request.path_params["id"]
-        for one in opened.project.state.specimens:
-            picture = opened.checks.picture(opened.project.path(one)) if one.id == wanted else None
+        for specimen in opened.project.state.specimens:
+            picture = opened.checks.picture(opened.project.path(specimen)) if specimen.id == wanted else None
             if picture is not None and picture.is_file():
                 return FileResponse(picture, media_type="image/webp")
         raise HTTPException(404, "There is no picture of this specimen.")
 
     async def _edit(self, request: Request) -> Response:
         content = await json_body(request, _REQUEST_BYTES)
-        return self._edited(lambda: self._project.project.edit(_revision(content), change_of(content)))
+        return self._apply_edit(lambda: self._project.project.edit(_revision(content), change_of(content)))
 
     async def _undo(self, request: Request) -> Response:
         content = await json_body(request, _REQUEST_BYTES)
-        return self._edited(lambda: self._project.project.undo(_revision(content)))
+        return self._apply_edit(lambda: self._project.project.undo(_revision(content)))
 
     async def _redo(self, request: Request) -> Response:
         content = await json_body(request, _REQUEST_BYTES)
-        return self._edited(lambda: self._project.project.redo(_revision(content)))
+        return self._apply_edit(lambda: self._project.project.redo(_revision(content)))
 
-    def _edited(self, edit: Callable[[], None]) -> Response:
+    def _apply_edit(self, edit: Callable[[], None]) -> Response:
         try:
             edit()
         except StaleError as error:
@@ -408,7 +411,7 @@ class Studio:
         folder, paths = self._result_files(number)
         name = f"{Path(self._project.jobs.get(number).output).name}.zip"
         headers = {"Content-Disposition": f'attachment; filename="{name}"'}
-        return StreamingResponse(_zipped(folder, paths), media_type="application/zip", headers=headers)
+        return StreamingResponse(_zip_files(folder, paths), media_type="application/zip", headers=headers)
 
     async def _view(self, scope: Any, receive: Any, send: Any) -> None:
         await self._project.views(scope, receive, send)
@@ -418,11 +421,11 @@ class Studio:
         path = result_path(folder, self._project.jobs.get(number).output)
         if path.is_file():
             return folder, [path]
-        found = sorted(one for one in path.rglob("*") if one.is_file() and one.name != LOCK)
+        found = sorted(file for file in path.rglob("*") if file.is_file() and file.name != LOCK)
         return folder, found[:_MOST_LISTED]
 
 
-def _refuse_change(request: Request) -> Response:
+def _reject_change(request: Request) -> Response:
     return refusal(403, "This page only shows the project; run shapespace studio to change it.")
 
 
@@ -444,7 +447,7 @@ class _Pieces:
         return taken
 
 
-def _zipped(folder: Path, paths: list[Path]) -> Generator[bytes]:
+def _zip_files(folder: Path, paths: list[Path]) -> Generator[bytes]:
     """Yield a zip archive of files, without holding it in memory."""
     pieces = _Pieces()
     with zipfile.ZipFile(cast(Any, pieces), "w", zipfile.ZIP_DEFLATED) as archive:

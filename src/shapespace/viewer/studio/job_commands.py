@@ -1,4 +1,4 @@
-"""The commands of jobs: what the user chose on the page to the arguments of a shapespace command."""
+"""The commands of jobs: from the choices of the user on the page to the arguments of a shapespace command."""
 
 from __future__ import annotations
 
@@ -26,31 +26,31 @@ def order(
     """Return the command of a new job, and write the files that it reads.
 
     Args:
-        project: with the specimens.
-        jobs: those before.
-        forms: of all kinds, whose options are accepted.
-        kind: of the job.
-        options: flag -> value, as the page sends them.
+        project: project with the specimens.
+        jobs: earlier jobs.
+        forms: forms of all kinds, whose options are accepted.
+        kind: kind of the job.
+        options: flag -> value, as sent by the page.
         on: number of the job whose result it uses; None for the newest that succeeded.
-        number: of the new job.
+        number: number of the new job.
 
     Raises:
         InputError: it cannot be run: no such kind or option, or a result or specimens are missing.
         FileError: the files cannot be written.
     """
     words = forms.get("correspond" if kind == "redo" else kind, {}).get("command", ())
-    given = [] if kind == "redo" else _given(forms, kind, options)
+    given = [] if kind == "redo" else _option_arguments(forms, kind, options)
     folder, stem = project.folder, f"{_INPUTS}/{number:04d}"
     state, listed = project.state, f"{stem}.csv"
     if kind == "correspond":
-        chosen = _some(state.chosen("training"), "to bring into correspondence", 2)
+        chosen = _require_specimens(state.chosen("training"), "to bring into correspondence", 2)
         prepared = project.write_scans(folder / listed, chosen)
         output = f"correspondence-{number}"
         return Order((*words, listed, "-o", output, *given), output, prepared)
     if kind == "redo":
         before = result_of(jobs, CORRESPONDENCES, on)
         name = str(options.get("name", ""))
-        if name not in {one.id for one in state.specimens}:
+        if name not in {specimen.id for specimen in state.specimens}:
             raise InputError(f"There is no specimen {name[:40]!r}; choose one of the list.")
         return Order((*words, "--redo", name, "-o", before.output), before.output)
     if kind == "build":
@@ -70,7 +70,7 @@ def order(
         return Order((*words, result_of(jobs, CORRESPONDENCES, on).output, "-o", output, *given), output)
     if kind in ("fit", "complete"):
         model = result_of(jobs, ("build",), on).output
-        chosen = _some(state.chosen("new"), "to fit; drop new scans", 1)
+        chosen = _require_specimens(state.chosen("new"), "to fit; drop new scans", 1)
         prepared = project.write_scans(folder / listed, chosen)
         output = f"{'fits' if kind == 'fit' else 'completed'}-{number}"
         return Order((*words, model, listed, "-o", output, *given), output, prepared)
@@ -101,8 +101,10 @@ def _question(
     chosen = _specimens_of(project, shapes)
     if kind == "score":
         reference, others = _by_class(chosen, options.get("--reference"))
-        project.write_table(project.folder / f"{stem}.csv", _some(others, "to score", 1))
-        project.write_table(project.folder / f"{stem}-reference.csv", _some(reference, "in the reference", 2))
+        project.write_table(project.folder / f"{stem}.csv", _require_specimens(others, "to score", 1))
+        project.write_table(
+            project.folder / f"{stem}-reference.csv", _require_specimens(reference, "in the reference", 2)
+        )
         population = project.folder / f"{stem}-reference.toml"
         write_cohort_file(population, population.with_suffix(".csv"), shapes=project.folder / shapes.output)
         given = [word for word in given if not word.startswith("--reference=")]
@@ -111,12 +113,12 @@ def _question(
              *given),
             output, on=shapes.number,
         )  # fmt: skip
-    project.write_table(project.folder / f"{stem}.csv", _some(chosen, "to analyse", 2))
+    project.write_table(project.folder / f"{stem}.csv", _require_specimens(chosen, "to analyse", 2))
     return Order((*words, f"{stem}.csv", "--shapes", shapes.output, "-o", output, *given), output, on=shapes.number)
 
 
 def shapes_of(jobs: Sequence[Job], kind: str, on: int | None) -> Job:
-    """Return the job whose shapes a question is about: fits, or surfaces in correspondence where they are not chosen.
+    """Return the job whose shapes a question is about: fits, or surfaces in correspondence if no job is chosen.
 
     Raises:
         InputError: there is none.
@@ -136,8 +138,8 @@ def _by_class(specimens: Sequence[Specimen], named: Any) -> tuple[Sequence[Speci
     column, _, value = str(named or "").partition("=")
     members: list[Specimen] = []
     others: list[Specimen] = []
-    for one in specimens:
-        (members if value and one.cells.get(column) == value else others).append(one)
+    for specimen in specimens:
+        (members if value and specimen.cells.get(column) == value else others).append(specimen)
     return members, others
 
 
@@ -163,11 +165,11 @@ def checks(
     formula = f"{options.get('--formula', '')} {options.get('--covariates', '')}"
     used = {str(value) for value in options.values() if isinstance(value, str)}
     columns = [column for column in project.state.columns if column in used or _in_formula(column, formula)]
-    missing = {column: sum(not one.cells.get(column) for one in chosen) for column in columns}
+    missing = {column: sum(not specimen.cells.get(column) for specimen in chosen) for column in columns}
     of_all = len(chosen)
     drop_missing = options.get("--missing") == "drop"
     if drop_missing:
-        chosen = [one for one in chosen if all(one.cells.get(column) for column in columns)]
+        chosen = [specimen for specimen in chosen if all(specimen.cells.get(column) for column in columns)]
     enough = len(chosen) >= 2
     take = "specimen takes" if len(chosen) == 1 else "specimens take"
     found = [{"level": "ok" if enough else "problem", "text": f"{len(chosen)} {take} part."}]
@@ -180,9 +182,9 @@ def checks(
         text = "Choose one column: a target to predict a number from shape, or along to predict shapes along a number."
         found.append({"level": "problem", "text": text})
     for column in columns:
-        cells = [one.cells.get(column, "") for one in chosen]
+        cells = [specimen.cells.get(column, "") for specimen in chosen]
         if missing[column]:
-            what = "these are left out" if drop_missing else "fill it in, or exclude these with missing: drop"
+            what = "these are excluded" if drop_missing else "fill it in, or exclude these with missing: drop"
             text = f"{column} is missing for {missing[column]} of {of_all} specimens; {what}."
             found.append({"level": "warning" if drop_missing else "problem", "text": text})
         classes = {cell: cells.count(cell) for cell in dict.fromkeys(cells) if cell}
@@ -205,7 +207,7 @@ def _in_formula(column: str, formula: str) -> bool:
     return column in words or f"`{column}`" in formula
 
 
-def _given(forms: Forms, kind: str, options: Mapping[str, Any]) -> list[str]:
+def _option_arguments(forms: Forms, kind: str, options: Mapping[str, Any]) -> list[str]:
     """Return the options as arguments.
 
     Raises:
@@ -225,24 +227,24 @@ def _given(forms: Forms, kind: str, options: Mapping[str, Any]) -> list[str]:
     return arguments
 
 
-def _some(specimens: Sequence[Specimen], purpose: str, least: int) -> Sequence[Specimen]:
+def _require_specimens(specimens: Sequence[Specimen], purpose: str, least: int) -> Sequence[Specimen]:
     if len(specimens) < least:
         raise InputError(f"There {'is no included specimen' if not specimens else 'is one specimen'} {purpose}.")
     return specimens
 
 
 def _surfaces(project: Project, before: Job) -> list[str]:
-    """Return the folder in correspondence, or the surfaces of the included specimens where others are excluded."""
-    chosen = [f"{before.output}/{one.id}.ply" for one in project.state.chosen("training")]
+    """Return the folder in correspondence, or the surfaces of the included specimens if others are excluded."""
+    chosen = [f"{before.output}/{specimen.id}.ply" for specimen in project.state.chosen("training")]
     there = [path for path in chosen if (project.folder / path).is_file()]
     made = {path.stem for path in (project.folder / before.output).glob("*.ply")}
-    excluded = [one for one in project.state.specimens if not one.included and one.id in made]
+    excluded = [specimen for specimen in project.state.specimens if not specimen.included and specimen.id in made]
     if excluded:
-        return list(_some_files(there))
+        return list(_require_files(there))
     return [before.output]
 
 
-def _some_files(paths: Sequence[str]) -> Sequence[str]:
+def _require_files(paths: Sequence[str]) -> Sequence[str]:
     if len(paths) < 2:
         raise InputError("Fewer than two included specimens are in correspondence; include more.")
     return paths

@@ -33,18 +33,18 @@ class Job(Struct, frozen=True, kw_only=True):
     """A command of a project; `job.json` contains all but its status, which follows from the files of its process.
 
     Args:
-        number: from 1.
-        kind: what it does.
-        arguments: of the command, relative to the project's folder.
-        output: what it writes, relative to the folder.
-        before: arguments of the commands that write what it reads, in order.
+        number: number of the job, from 1.
+        kind: kind of the command, such as `build`.
+        arguments: arguments of the command, relative to the project's folder.
+        output: path of the result, relative to the folder.
+        before: arguments of the commands that write its input, in order.
         options: flag -> value, as the user chose them.
         on: number of the job whose shapes a question is about.
-        wanted: whether it is to run, or has ended.
-        status: of it.
-        code: exit code, once it ended.
-        seconds: it took.
-        message: the last line of its log.
+        wanted: whether the job is to run, or has ended.
+        status: status of the job.
+        code: exit code after the end.
+        seconds: run time, s.
+        message: last line of the log.
     """
 
     number: int
@@ -62,7 +62,7 @@ class Job(Struct, frozen=True, kw_only=True):
 
     @property
     def command(self) -> str:
-        """The command line; a line each of several commands."""
+        """The command line; one line per command."""
         return "\n".join(shlex.join(["shapespace", *words]) for words in (*self.before, self.arguments))
 
 
@@ -71,9 +71,9 @@ class Order:
     """A command to be run.
 
     Args:
-        arguments: after `shapespace`, relative to the project's folder.
-        output: what it writes, relative to the folder.
-        before: arguments of the commands that write what it reads, in order.
+        arguments: arguments after `shapespace`, relative to the project's folder.
+        output: path of the result, relative to the folder.
+        before: arguments of the commands that write its input, in order.
         on: number of the job whose shapes a question is about.
     """
 
@@ -87,9 +87,9 @@ class Jobs:
     """The owner of the jobs of a project. A thread starts the next one when none runs.
 
     Args:
-        folder: of the project.
-        changed: called when a job changed.
-        read_only: look at the jobs alone; nothing is started or written.
+        folder: folder of the project.
+        changed: function that is called when a job changed.
+        read_only: whether to only read the jobs; nothing is started or written.
     """
 
     def __init__(self, folder: Path, changed: Callable[[], None], *, read_only: bool = False) -> None:
@@ -103,7 +103,7 @@ class Jobs:
         for path in sorted(self._folder.glob(f"*/{JOB}")):
             with contextlib.suppress(OSError, ValueError):
                 job = read(Job, json.loads(path.read_text(encoding="utf-8")), str(path), "remove it")
-                self._jobs[job.number] = self._looked_at(job)
+                self._jobs[job.number] = self._with_status(job)
         self._thread = threading.Thread(target=self._work, name="studio jobs", daemon=True)
         if not read_only:
             self._write_history()
@@ -129,8 +129,8 @@ class Jobs:
         """Add a job.
 
         Args:
-            kind: what it does.
-            make: returns its command, given its number and the jobs before.
+            kind: kind of the command.
+            make: function that returns its command, given its number and the earlier jobs.
             options: flag -> value, as the user chose them.
         """
         with self._lock:
@@ -154,7 +154,7 @@ class Jobs:
                 self._put(replace(job, wanted=False, status="cancelled", message="It was cancelled before it began."))
 
     def go_on(self, number: int) -> None:
-        """Queue a job that did not succeed again; commands go on from what is complete.
+        """Queue a job that did not succeed again; commands continue from the complete results.
 
         Raises:
             InputError: it waits, runs or succeeded.
@@ -162,21 +162,21 @@ class Jobs:
         with self._lock:
             job = self.get(number)
             if job.status not in ("failed", "cancelled", "interrupted"):
-                raise InputError(f"Job {number} is {job.status}; only one that did not succeed can go on.")
+                raise InputError(f"Job {number} is {job.status}; only a job that did not succeed can be continued.")
             self._started.pop(number, None)
             for name in (EXIT, CANCEL, PROGRESS):
                 (self.folder_of(job) / name).unlink(missing_ok=True)
             self._put(replace(job, wanted=True, status="waiting", code=None, message=""))
 
     def log(self, number: int) -> str:
-        """Return what the command printed."""
+        """Return the output of the command."""
         try:
             return (self.folder_of(self.get(number)) / LOG).read_text(encoding="utf-8", errors="replace")
         except OSError:
             return ""
 
     def progress(self, job: Job) -> dict[str, Any] | None:
-        """Return what a running job does (`doing`, `done`, `total`, `left_s`), None where it does not say."""
+        """Return the progress of a running job (`doing`, `done`, `total`, `left_s`); None if it is unknown."""
         try:
             state = json.loads((self.folder_of(job) / PROGRESS).read_text(encoding="utf-8"))
             done, total, began = float(state["done"]), float(state["total"] or 0), float(state["began"])
@@ -186,7 +186,7 @@ class Jobs:
         return {"doing": str(state["doing"]), "done": done, "total": total or None, "left_s": left}
 
     def running_for(self, job: Job) -> float:
-        """Return for how many seconds a job has run."""
+        """Return the run time of a job, s."""
         return time.time() - self._started.get(job.number, time.time()) if job.status == "running" else job.seconds
 
     def folder_of(self, job: Job) -> Path:
@@ -194,7 +194,7 @@ class Jobs:
         return self._folder / f"{job.number:04d}"
 
     def close(self) -> None:
-        """End the thread; a running job goes on."""
+        """End the thread; a running job continues."""
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join()
@@ -210,7 +210,7 @@ class Jobs:
             with self._lock:
                 for job in self.all():
                     if job.status == "running":
-                        self._set(self._looked_at(job))
+                        self._set(self._with_status(job))
                 jobs = self.all()
                 waiting = next((job for job in jobs if job.status == "waiting"), None)
                 if waiting is not None and all(job.status != "running" for job in jobs):
@@ -235,7 +235,7 @@ class Jobs:
             self._changed()
 
     def _write_history(self) -> None:
-        """Write `history.sh` into the project's folder; a full disk does not keep a job from ending."""
+        """Write `history.sh` into the project's folder; a full disk does not prevent the end of a job."""
         with contextlib.suppress(FileError):
             write_text(self._folder.parent / "history.sh", history(self.all()))
 
@@ -245,7 +245,7 @@ class Jobs:
         except OSError:
             return 0
 
-    def _looked_at(self, job: Job) -> Job:
+    def _with_status(self, job: Job) -> Job:
         """Return a job with the status that follows from the files of its process."""
         folder = self.folder_of(job)
         if not job.wanted:
@@ -257,13 +257,15 @@ class Jobs:
             seconds = float(ended.get("seconds", 0.0))
             return replace(job, status=status, code=code, seconds=seconds, message=self._last_line(folder))
         if is_running(folder):
-            self._started.setdefault(job.number, _modified(folder / JOB))
+            self._started.setdefault(job.number, _modified_s(folder / JOB))
             return replace(job, status="running")
         if job.status == "running" and time.time() - self._started.get(job.number, 0.0) < _START_S:
             # Its process is about to lock the folder, or has let go of it and is about to write how it ended.
             return job
         has_begun = job.status == "running" or (folder / LOG).exists()
-        message = "It ended without a result, as when the machine was switched off; it can go on." if has_begun else ""
+        message = (
+            "It ended without a result, as when the machine was switched off; it can be continued." if has_begun else ""
+        )
         return replace(job, status="interrupted" if has_begun else "waiting", message=message)
 
     @staticmethod
@@ -284,7 +286,7 @@ class Jobs:
         return messages[-1].removeprefix("shapespace: ") if messages else _NO_MESSAGE
 
 
-def _modified(path: Path) -> float:
+def _modified_s(path: Path) -> float:
     try:
         return path.stat().st_mtime
     except OSError:
@@ -292,10 +294,10 @@ def _modified(path: Path) -> float:
 
 
 def history(jobs: list[Job]) -> str:
-    """Return a shell script that computes the results of all jobs that succeeded anew."""
+    """Return a shell script that computes the results of all jobs that succeeded again."""
     lines = [
         "#!/bin/sh",
-        "# Computes the results of this project anew, from its inputs, in the folder given: sh history.sh FOLDER",
+        "# Computes the results of this project again, from its inputs, in the folder given: sh history.sh FOLDER",
         "set -u",
         'PROJECT=$(cd "$(dirname "$0")" && pwd)',
         'mkdir -p "${1:?Give a new folder for the results.}" && cd "$1" || exit 2',

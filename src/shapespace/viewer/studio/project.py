@@ -1,4 +1,4 @@
-"""A project of the studio: its specimens, their table, landmarks, and the edits of these."""
+"""A project of the studio: its specimens, their table, landmarks, and their edits."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ class Specimen(Struct, frozen=True, kw_only=True):
     """A specimen.
 
     Args:
-        id: its name, by which files of results are called.
-        file: the scan, relative to the project's folder where it lies in it.
-        role: whether models are built of it, or it is new to them.
-        included: whether it takes part.
-        unit: of the scan, a name of `MM_PER_UNIT`; empty where commands take it as it is.
+        id: name of the specimen, which names the files of its results.
+        file: path of the scan, relative to the project's folder if it lies there.
+        role: `training` for specimens that models are built from, `new` for others.
+        included: whether the specimen is used.
+        unit: unit of the scan, a name of `MM_PER_UNIT`; empty if commands read the scan as it is.
         mirrored: whether its mirror image is used.
-        cells: column -> its cell in the table.
+        cells: column -> cell of the specimen.
     """
 
     id: str
@@ -59,14 +59,14 @@ class Specimen(Struct, frozen=True, kw_only=True):
 
 
 class State(Struct, frozen=True, kw_only=True):
-    """What `project.json` contains.
+    """Content of `project.json`.
 
     Args:
-        name: of the project.
-        columns: of the table, besides the id.
-        specimens: in the order in which they were added.
-        landmarks: name -> vertex of the surfaces in correspondence,
-        landmarks_on: in this folder of the project.
+        name: name of the project.
+        columns: columns of the table, except the id.
+        specimens: specimens in the order in which they were added.
+        landmarks: name -> vertex of the surfaces in correspondence.
+        landmarks_on: folder of these surfaces in the project.
     """
 
     FORMAT: ClassVar[str] = "shapespace-project"
@@ -81,18 +81,18 @@ class State(Struct, frozen=True, kw_only=True):
 
     def chosen(self, role: Role) -> tuple[Specimen, ...]:
         """Return the included specimens of a role."""
-        return tuple(one for one in self.specimens if one.included and one.role == role)
+        return tuple(specimen for specimen in self.specimens if specimen.included and specimen.role == role)
 
     def notes(self) -> list[str]:
         """Return sentences on classes of the table that may be misspelt."""
-        cells = {column: [one.cells.get(column, "") for one in self.specimens] for column in self.columns}
+        cells = {column: [specimen.cells.get(column, "") for specimen in self.specimens] for column in self.columns}
         notes = [note for column in self.columns for note in notes_on_classes(column, cells[column])]
         return [note for note in notes if not note.startswith("Shapes in each class")]
 
     def counts(self) -> dict[str, dict[str, int]]:
         """Return the number of included specimens of each class, of columns with few classes."""
         counts = {
-            column: Counter(one.cells.get(column, "") for one in self.specimens if one.included)
+            column: Counter(specimen.cells.get(column, "") for specimen in self.specimens if specimen.included)
             for column in self.columns
         }
         return {column: dict(count) for column, count in counts.items() if 0 < len(count) <= _MOST_CLASSES}
@@ -102,8 +102,8 @@ class Project:
     """A project in a folder: the owner of its state, which is written with every edit.
 
     Args:
-        folder: with `project.json`.
-        state: of it.
+        folder: folder with `project.json`.
+        state: state of the project.
     """
 
     FILE = "project.json"
@@ -145,12 +145,12 @@ class Project:
 
     @property
     def undo_text(self) -> str | None:
-        """What an undo would take back."""
+        """Description of the edit that an undo would revert."""
         return self._undo[-1][0] if self._undo else None
 
     @property
     def redo_text(self) -> str | None:
-        """What was undone last."""
+        """Description of the edit that was undone last."""
         return self._redo[-1][0] if self._redo else None
 
     def path(self, specimen: Specimen) -> Path:
@@ -161,12 +161,12 @@ class Project:
         """Apply an edit, which can be undone.
 
         Args:
-            revision: of the state that the user saw; None for edits that any state allows.
-            change: returns what it does, in words, and the new state.
-            together: edits in a row with this text are undone at once.
+            revision: revision of the state that the user saw; None for edits that any state allows.
+            change: function that returns a description of the edit and the new state.
+            together: text of consecutive edits that are undone together.
 
         Raises:
-            InputError: another edit came in between, or `change` refuses it.
+            InputError: another edit came in between, or `change` rejects it.
             FileError: it cannot be written; the state stays as it was.
         """
         with self._lock:
@@ -188,7 +188,10 @@ class Project:
         """
 
         def without(state: State) -> State:
-            specimens = (replace(one, included=False) if self.path(one) == file else one for one in state.specimens)
+            specimens = (
+                replace(specimen, included=False) if self.path(specimen) == file else specimen
+                for specimen in state.specimens
+            )
             return replace(state, specimens=tuple(specimens))
 
         with self._lock:
@@ -262,8 +265,8 @@ class Project:
 
         Args:
             file: the scan.
-            role: of the specimen.
-            called: what the user calls the file (default: as it is called).
+            role: role of the specimen.
+            called: name of the file for the user (default: its own name).
 
         Raises:
             FileError: the scan cannot be read.
@@ -271,13 +274,13 @@ class Project:
         with self._lock:
             try:
                 size = file.stat().st_size
-                for one in self.state.specimens:
-                    other = self.path(one)
+                for existing in self.state.specimens:
+                    other = self.path(existing)
                     if other.is_file() and other.stat().st_size == size and filecmp.cmp(file, other, shallow=False):
-                        return one.id, one.id
+                        return existing.id, existing.id
             except OSError as error:
                 raise FileError(f"Cannot read {file}: {error.strerror or error}.") from error
-            taken = {one.id.casefold() for one in self.state.specimens}
+            taken = {existing.id.casefold() for existing in self.state.specimens}
             name = _free_name(_stem(called or file.name), taken)
             inside = file.is_relative_to(self.folder)
             place = file.relative_to(self.folder).as_posix() if inside else str(file)
@@ -290,7 +293,7 @@ class Project:
             return name, None
 
     def add_stored(self, file: Path, role: Role, called: str) -> tuple[str, str | None]:
-        """Add a scan in the project's folder, as `add` does; its file is removed where the scan is not added."""
+        """Add a scan in the project's folder, as `add` does; its file is removed if the scan is not added."""
         with self.removed_on_error(file):
             name, same = self.add(file, role, called)
         if same is not None:
@@ -298,7 +301,7 @@ class Project:
         return name, same
 
     def import_files(self, place: Path, role: Role, *, copy: bool) -> tuple[int, list[str]]:
-        """Add a scan or the scans of a folder on this machine; return how many, and sentences on what was not added.
+        """Add a scan or the scans of a folder on this machine; return their number, and sentences on the others.
 
         Raises:
             FileError: it cannot be read, or the copies not written.
@@ -326,30 +329,35 @@ class Project:
         """Write a list of scans with their ids and cells, as `correspond` and `fit` read it.
 
         Args:
-            path: of the list, in a folder of the project.
-            specimens: that it lists.
+            path: path of the list, in a folder of the project.
+            specimens: specimens of the list.
 
         Returns:
-            The commands that write scans in mm and their mirror images; the list names what they write.
+            The commands that write scans in mm and their mirror images; the list names their output.
         """
         columns, commands = self.state.columns, list[tuple[str, ...]]()
-        files = {one.id: _relative(self.path(one), path.parent) for one in specimens}
-        for unit, mirrored in sorted({(one.unit, one.mirrored) for one in specimens} - {("", False)}):
-            group = [one for one in specimens if (one.unit, one.mirrored) == (unit, mirrored)]
+        files = {specimen.id: _relative(self.path(specimen), path.parent) for specimen in specimens}
+        for unit, mirrored in sorted({(specimen.unit, specimen.mirrored) for specimen in specimens} - {("", False)}):
+            group = [specimen for specimen in specimens if (specimen.unit, specimen.mirrored) == (unit, mirrored)]
             folder = f"{path.stem}-{unit or 'scans'}{'-mirrored' if mirrored else ''}"
-            paths = [self.path(one) for one in group]  # `check` names its files by them
-            files |= {one.id: f"{folder}/{name}.ply" for one, name in zip(group, names_for(paths), strict=True)}
-            scans = [one.file for one in group]
+            paths = [self.path(specimen) for specimen in group]  # `check` names its files by them
+            files |= {
+                specimen.id: f"{folder}/{name}.ply" for specimen, name in zip(group, names_for(paths), strict=True)
+            }
+            scans = [specimen.file for specimen in group]
             options = [*([f"--unit={unit}"] if unit else []), *(["--mirror"] if mirrored else [])]
             commands.append(("check", *scans, "-o", f"{path.parent.name}/{folder}", *options, "--quiet"))
-        rows = [(one.id, files[one.id], *(one.cells.get(column, "") for column in columns)) for one in specimens]
+        rows = [
+            (specimen.id, files[specimen.id], *(specimen.cells.get(column, "") for column in columns))
+            for specimen in specimens
+        ]
         self._write_table(path, ("id", "file", *columns), rows)
         return tuple(commands)
 
     def write_table(self, path: Path, specimens: Iterable[Specimen]) -> None:
         """Write the table of specimens, as `compare` reads it."""
         columns = self.state.columns
-        rows = [(one.id, *(one.cells.get(column, "") for column in columns)) for one in specimens]
+        rows = [(specimen.id, *(specimen.cells.get(column, "") for column in columns)) for specimen in specimens]
         self._write_table(path, ("specimen", *columns), rows)
 
     def write_landmarks(self, path: Path) -> None:
@@ -369,13 +377,13 @@ def change_of(request: Mapping[str, Any]) -> Callable[[State], tuple[str, State]
     """Return the edit that a request of the page asks for.
 
     Raises:
-        InputError: by the edit, where a specimen or column does not exist, or a name cannot be used.
+        InputError: by the edit, if a specimen or column does not exist, or a name cannot be used.
     """
     what = str(request.get("what", ""))
     edits = {
-        "cells": _cells, "include": _include, "set": _set, "remove": _remove, "rename": _rename,
-        "unit": _unit, "mirror": _mirror, "add-column": _add_column, "remove-column": _remove_column,
-        "landmarks": _landmarks,
+        "cells": _edit_cells, "include": _include, "set": _set_role, "remove": _remove, "rename": _rename,
+        "unit": _set_unit, "mirror": _mirror, "add-column": _add_column, "remove-column": _remove_column,
+        "landmarks": _set_landmarks,
     }  # fmt: skip
 
     def change(state: State) -> tuple[str, State]:
@@ -389,44 +397,52 @@ def change_of(request: Mapping[str, Any]) -> Callable[[State], tuple[str, State]
     return change
 
 
-def _cells(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
+def _edit_cells(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
     by_id: dict[str, dict[str, str]] = {}
     for cell in request["cells"]:
         _check_column(state, cell["column"])
         by_id.setdefault(cell["id"], {})[cell["column"]] = str(cell["value"]).strip()[:_LONGEST_CELL]
-    edited = _edited(state, by_id, lambda one: replace(one, cells={**one.cells, **by_id[one.id]}))
+    edited = _edit_specimens(
+        state, by_id, lambda specimen: replace(specimen, cells={**specimen.cells, **by_id[specimen.id]})
+    )
     count = sum(map(len, by_id.values()))
     return f"edit {count} cell{'' if count == 1 else 's'}", edited
 
 
 def _include(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
     ids, included = request["ids"], bool(request["included"])
-    edited = _edited(state, ids, lambda one: replace(one, included=included))
-    return f"{'include' if included else 'exclude'} {_count(ids)}", edited
+    edited = _edit_specimens(state, ids, lambda specimen: replace(specimen, included=included))
+    return f"{'include' if included else 'exclude'} {_count_text(ids)}", edited
 
 
-def _unit(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
+def _set_unit(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
     ids, unit = request["ids"], request["unit"]
     if unit and unit not in MM_PER_UNIT:
         raise InputError(f"There is no unit {unit!r:.30}; choose one of {', '.join(MM_PER_UNIT)}.")
-    return f"set the unit of {_count(ids)}", _edited(state, ids, lambda one: replace(one, unit=unit))
+    return f"set the unit of {_count_text(ids)}", _edit_specimens(
+        state, ids, lambda specimen: replace(specimen, unit=unit)
+    )
 
 
 def _mirror(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
     ids, mirrored = request["ids"], bool(request["mirrored"])
-    return f"mirror {_count(ids)}", _edited(state, ids, lambda one: replace(one, mirrored=mirrored))
+    return f"mirror {_count_text(ids)}", _edit_specimens(
+        state, ids, lambda specimen: replace(specimen, mirrored=mirrored)
+    )
 
 
-def _set(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
+def _set_role(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
     role: Role = "new" if request["set"] == "new" else "training"
-    return f"move {_count(request['ids'])}", _edited(state, request["ids"], lambda one: replace(one, role=role))
+    return f"move {_count_text(request['ids'])}", _edit_specimens(
+        state, request["ids"], lambda specimen: replace(specimen, role=role)
+    )
 
 
 def _remove(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
     gone = set(request["ids"])
-    _edited(state, gone, lambda one: one)
-    return f"remove {_count(gone)}", replace(
-        state, specimens=tuple(one for one in state.specimens if one.id not in gone)
+    _edit_specimens(state, gone, lambda specimen: specimen)
+    return f"remove {_count_text(gone)}", replace(
+        state, specimens=tuple(specimen for specimen in state.specimens if specimen.id not in gone)
     )
 
 
@@ -434,9 +450,9 @@ def _rename(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
     old, new = request["id"], str(request["to"]).strip()
     if not new or len(new) > _LONGEST_ID or new.startswith(".") or _NO_FILE_NAME.search(new):
         raise InputError(f"A specimen cannot be called {new[:40]!r}, as files of results are called so.")
-    if any(one.id.casefold() == new.casefold() for one in state.specimens if one.id != old):
+    if any(specimen.id.casefold() == new.casefold() for specimen in state.specimens if specimen.id != old):
         raise InputError(f"There is a specimen {new} already; choose another name.")
-    return f"rename {old}", _edited(state, [old], lambda one: replace(one, id=new))
+    return f"rename {old}", _edit_specimens(state, [old], lambda specimen: replace(specimen, id=new))
 
 
 def _add_column(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
@@ -450,13 +466,14 @@ def _remove_column(state: State, request: Mapping[str, Any]) -> tuple[str, State
     column = request["column"]
     _check_column(state, column)
     specimens = tuple(
-        replace(one, cells={key: cell for key, cell in one.cells.items() if key != column}) for one in state.specimens
+        replace(specimen, cells={key: cell for key, cell in specimen.cells.items() if key != column})
+        for specimen in state.specimens
     )
-    kept = tuple(one for one in state.columns if one != column)
+    kept = tuple(column for column in state.columns if column != column)
     return f"remove the column {column}", replace(state, columns=kept, specimens=specimens)
 
 
-def _landmarks(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
+def _set_landmarks(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
     landmarks = {str(name).strip()[:60]: int(vertex) for name, vertex in request["landmarks"].items()}
     if "" in landmarks or min(landmarks.values(), default=0) < 0:
         raise InputError("A landmark needs a name and a vertex.")
@@ -466,7 +483,7 @@ def _landmarks(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
 def cells_of_table(
     content: bytes, state: State, name: str = "The table"
 ) -> tuple[list[str], dict[str, dict[str, str]], list[str]]:
-    """Return the columns of a table (CSV, TSV or .xlsx), the cells of each specimen that it has a row of, and sentences
+    """Return the columns of a table (CSV, TSV or .xlsx), the cells of each specimen with a row, and sentences
     on rows without a specimen and specimens without a row.
 
     Rows are matched to ids and files as commands match them.
@@ -476,7 +493,7 @@ def cells_of_table(
         InputError: no row is of a specimen.
     """
     table = read_table(Path(name), content)
-    named = [(one.id, *names_of_file(Path(one.file).name)) for one in state.specimens]
+    named = [(specimen.id, *names_of_file(Path(specimen.file).name)) for specimen in state.specimens]
     matched, notes = match_rows(table, named, "the project", "name the specimens alike")
     cells = {
         state.specimens[k].id: {head: column[row][:_LONGEST_CELL] for head, column in table.columns.items()}
@@ -489,18 +506,22 @@ def with_cells(columns: Sequence[str], cells: Mapping[str, Mapping[str, str]]) -
     """Return the edit that takes the columns and cells of a table."""
 
     def change(state: State) -> tuple[str, State]:
-        edited = _edited(state, cells, lambda one: replace(one, cells={**one.cells, **cells[one.id]}))
+        edited = _edit_specimens(
+            state, cells, lambda specimen: replace(specimen, cells={**specimen.cells, **cells[specimen.id]})
+        )
         together = tuple(dict.fromkeys((*state.columns, *columns)))
         return f"take a table of {len(cells)} specimens", replace(edited, columns=together)
 
     return change
 
 
-def _edited(state: State, ids: Iterable[str], change: Callable[[Specimen], Specimen]) -> State:
+def _edit_specimens(state: State, ids: Iterable[str], change: Callable[[Specimen], Specimen]) -> State:
     wanted = set(ids)
-    if unknown := wanted - {one.id for one in state.specimens}:
+    if unknown := wanted - {specimen.id for specimen in state.specimens}:
         raise InputError(f"There is no specimen {sorted(unknown)[0][:40]!r}; reload the page.")
-    return replace(state, specimens=tuple(change(one) if one.id in wanted else one for one in state.specimens))
+    return replace(
+        state, specimens=tuple(change(specimen) if specimen.id in wanted else specimen for specimen in state.specimens)
+    )
 
 
 def _check_column(state: State, column: str) -> None:
@@ -508,7 +529,7 @@ def _check_column(state: State, column: str) -> None:
         raise InputError(f"The table has no column {str(column)[:40]!r}; add it first.")
 
 
-def _count(ids: Iterable[str]) -> str:
+def _count_text(ids: Iterable[str]) -> str:
     names = list(ids)
     return names[0] if len(names) == 1 else f"{len(names)} specimens"
 
@@ -530,7 +551,7 @@ def _free_name(stem: str, taken: set[str], ending: str = "") -> str:
 
 
 def _relative(path: Path, folder: Path) -> str:
-    """Return `path` relative to `folder` where both lie in the same project, else as it is."""
+    """Return `path` relative to `folder` if both lie in the same project, else as it is."""
     project = folder.parent
     return f"../{path.relative_to(project).as_posix()}" if path.is_relative_to(project) else str(path)
 
@@ -541,14 +562,17 @@ def recent_projects(add: Path | None = None) -> list[dict[str, Any]]:
 
     path = user_state_path("shapespace", appauthor=False) / "projects.json"
     try:
-        folders = [str(one) for one in json.loads(path.read_text(encoding="utf-8"))]
+        folders = [str(folder) for folder in json.loads(path.read_text(encoding="utf-8"))]
     except (OSError, ValueError, TypeError):
         folders = []
     if add is not None:
-        folders = [str(add), *(one for one in folders if one != str(add))][:10]
+        folders = [str(add), *(folder for folder in folders if folder != str(add))][:10]
         try:
             make_folder(path.parent)
             write_text(path, json.dumps(folders))
         except FileError:
             pass  # the list is a convenience; a read-only home must not keep a project from being opened
-    return [{"name": Path(one).name, "folder": one, "exists": (Path(one) / Project.FILE).is_file()} for one in folders]
+    return [
+        {"name": Path(folder).name, "folder": folder, "exists": (Path(folder) / Project.FILE).is_file()}
+        for folder in folders
+    ]

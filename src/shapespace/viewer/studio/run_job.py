@@ -2,7 +2,7 @@
 
     python -m shapespace.viewer.studio.run_job FOLDER
 
-FOLDER contains job.json. This process holds a lock on FOLDER/lock while it runs, writes what the command prints to
+FOLDER contains job.json. This process locks FOLDER/lock while it runs, writes the output of the command to
 FOLDER/log.txt, and its exit code to FOLDER/exit.json at the end. A file FOLDER/cancel interrupts the command, as Ctrl-C
 does.
 """

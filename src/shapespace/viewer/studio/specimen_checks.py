@@ -28,12 +28,12 @@ _MOST_PROCESSES = 4
 
 
 class SpecimenChecks:
-    """The owner of the checks of a project's scans. They are known again by path, size and time of change.
+    """The owner of the checks of a project's scans. Files are identified by name, size and time of change.
 
     Args:
-        folder: of the project.
-        changed: called when a check was finished,
-        unusable: and before, with the path of a scan that cannot be used.
+        folder: folder of the project.
+        changed: function that is called when a check was finished.
+        unusable: function that is called before that, with the path of a scan that cannot be used.
     """
 
     def __init__(
@@ -82,9 +82,9 @@ class SpecimenChecks:
             if future.cancelled():
                 return
             if future.exception() is not None:
-                self._known[key] = self._failed(future.exception())
+                self._known[key] = self._facts_of_failure(future.exception())
             if key in self._known or future.result()["state"] == "unusable":
-                # On a full disk the scan stays included; commands refuse it.
+                # On a full disk the scan stays included; commands reject it.
                 with contextlib.suppress(FileError):
                     self._unusable(scan)
             self._changed()
@@ -97,7 +97,7 @@ class SpecimenChecks:
             self._pool = ProcessPoolExecutor(processes, mp_context=context(), initializer=_start_process)
         return self._pool
 
-    def _failed(self, error: BaseException | None) -> dict[str, Any]:
+    def _facts_of_failure(self, error: BaseException | None) -> dict[str, Any]:
         """Return the facts of a scan whose check ended with an error; it is not tried again."""
         if isinstance(error, ShapespaceError):
             return _unusable(f"It cannot be checked: {error}")
@@ -125,7 +125,9 @@ def check_scan(scan: Path, stem: Path) -> dict[str, Any]:
     """Write the facts and the picture of a scan next to `stem`, and return the facts."""
     try:
         report, repaired = examine_and_repair(read_mesh(scan))
-        findings = [{"level": one.level, "text": f"{one.problem} {one.action}"} for one in report.findings]
+        findings = [
+            {"level": finding.level, "text": f"{finding.problem} {finding.action}"} for finding in report.findings
+        ]
         facts = {
             "state": "unusable" if repaired is None else "ready",
             "vertices": report.vertices, "triangles": report.triangles,

@@ -49,7 +49,7 @@ class Views:
     """ASGI application of the pages of results, opened when they are first asked for.
 
     Args:
-        result: returns the path of the result of a job; None where it has none.
+        result: function that returns the path of the result of a job; None if it has none.
         upload_bytes: size limit of scans that are dropped onto a model's page.
     """
 
@@ -94,13 +94,13 @@ class Views:
         with self._lock:
             if key not in self._open:
                 stack = ExitStack()
-                self._open[key] = (self._made(path, stack), stack)
+                self._open[key] = (self._make_app(path, stack), stack)
             self._open.move_to_end(key)
             while len(self._open) > _MOST_OPEN:
                 self._open.popitem(last=False)[1][1].close()
             return self._open[key][0]
 
-    def _made(self, path: Path, stack: ExitStack) -> ASGIApp:
+    def _make_app(self, path: Path, stack: ExitStack) -> ASGIApp:
         if (path / CorrespondenceRecord.FILE).is_file():
             return surfaces_app(Surfaces(path))
         view = ModelView.open(path)
