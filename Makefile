@@ -36,6 +36,7 @@ test-oldest test-newest:
 lint: $(READY_TO_LINT)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/python tools/check_language.py
 
 types: $(READY_TO_LINT)
 	$(BIN)/pyright --pythonpath $(BIN)/python

@@ -14,13 +14,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 PATTERNS = {
-    r"\bholds?\b": "contains, stores, constrains, is true",
+    r"\bholds?\b(?!:)": "contains, stores, constrains, is true",
     r"\b(?:left|leav(?:e|es|ing)) out\b|\bleft-out\b": "excluded, omitted, held out",
     r"\bwhole\b": "complete, intact, entire",
     r"\brefus": "reject, raise, check",
     r"\bstands?\b(?! (?:alone|for)\b)": "is",
     r"\bbeside\b": "next to, in addition to, compared with",
-    r"\b(?:says?|said|tells?|told)\b": "reports, states, distinguishes",
+    r"\b(?:says?|said|tells?|told)\b(?!:)": "reports, states, distinguishes",
     r"\b[Aa]s of `|: as of ": "see `x`",
     r"\bwhere (?:there (?:is|are) (?:none|no\b)|none (?:is|are))": "None if there is no ..., if ... is unknown",
     r"\bgoes (?:by|on)\b": "depends on, continues",
