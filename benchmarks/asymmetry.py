@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from shapespace.cohort.cohort import Cohort, Fitted
+from shapespace.cohort.cohort import Cohort, FitDiagnostics
 from shapespace.datasets.faces import Warp, load_faces
 from shapespace.datasets.simulated_scan import Hole, random_similarity, simulate_scan
 from shapespace.fit.fit_scan import FitConfig, fit_scan
@@ -164,7 +164,7 @@ def fits(kind: Kind, subjects: int, people: int, seed: int) -> list[tuple[str, s
     rows: list[tuple[str, str, list[str]]] = []
     for name, model in models.items():
         results = [fit_scan(model, scan, FitConfig(dense=True, unit="mm")) for scan in scans]
-        fitted = Fitted(
+        fitted = FitDiagnostics(
             model,
             np.stack([r.b for r in results]),
             np.stack([r.b_stddev for r in results]),

@@ -21,7 +21,7 @@ import pooch
 from scipy.spatial import ConvexHull, Delaunay
 
 from shapespace import ShapeModel, fit_scan, load_faces, simulate_scan
-from shapespace.cohort.cohort import Cohort, Fitted
+from shapespace.cohort.cohort import Cohort, FitDiagnostics
 from shapespace.cohort.table import Table
 from shapespace.datasets.simulated_scan import Cut
 from shapespace.errors import FitError
@@ -140,7 +140,7 @@ def people_of(folders: list[Path]) -> tuple[Cohort, list[str]]:
                 who.append(f"{folder.name}/{file.stem}")
     names = tuple(f"scan {at}" for at in range(len(b)))
     table = Table({"subject": tuple(who)}, names)
-    fitted = Fitted(model, np.stack(b), np.stack(stddev), ("converged",) * len(b), "")
+    fitted = FitDiagnostics(model, np.stack(b), np.stack(stddev), ("converged",) * len(b), "")
     seen = np.arange(0, len(model.mean_vertices), EVERY)
     x = model.mean_vertices[seen]
     faces = Delaunay(x[:, :2]).simplices.astype(np.int32)
@@ -212,7 +212,7 @@ def power(pool: Pool, surfaces: str, studies: int, permutations: int) -> str:
     names = tuple(f"person {at}" for at in range(2 * count))
     table = Table({"group": ("one",) * count + ("other",) * count}, names)
     b, stddev = pool.b.reshape(2 * count, -1), pool.b_stddev.reshape(2 * count, -1)
-    fitted = Fitted(pool.model, b, stddev, ("converged",) * len(b), "")
+    fitted = FitDiagnostics(pool.model, b, stddev, ("converged",) * len(b), "")
     if surfaces == "coefficients":
         cohort = Cohort.of_fits(fitted, names, table, np.full(len(b), np.nan))
     else:

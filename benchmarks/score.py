@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shapespace.cohort.cohort import Cohort, Fitted
+from shapespace.cohort.cohort import Cohort, FitDiagnostics
 from shapespace.cohort.table import Table
 from shapespace.fit.robust.posterior import variance_of_new_shapes
 from shapespace.model.shape_model import ShapeModel
@@ -28,7 +28,7 @@ _USED = (0, 1)
 
 def cohort(model: ShapeModel, b: FloatArray, b_stddev: FloatArray, names: Sequence[str]) -> Cohort:
     """Return fits as a cohort."""
-    fitted = Fitted(model, b, b_stddev, ("converged",) * len(b), "fits")
+    fitted = FitDiagnostics(model, b, b_stddev, ("converged",) * len(b), "fits")
     return Cohort.of_fits(fitted, names, Table({}, tuple(names)), np.full(len(b), np.nan))
 
 

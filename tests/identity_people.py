@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from shapespace.cohort.cohort import Cohort, Fitted
+from shapespace.cohort.cohort import Cohort, FitDiagnostics
 from shapespace.cohort.table import Table
 from shapespace.statistics.identity.scores import Samples
 from shapespace.types import FloatArray
@@ -40,7 +40,7 @@ def cohort(count: int = 12, scans: int = 3, seed: int = 0) -> Cohort:
     table = Table({"subject": samples.subjects, "expression": shown}, names, "people.csv")
     b = samples.x * model.stddev
     stated = np.sqrt(samples.variance) * model.stddev
-    fitted = Fitted(model, b, stated, ("converged",) * len(b), "fits")
+    fitted = FitDiagnostics(model, b, stated, ("converged",) * len(b), "fits")
     return Cohort.of_fits(fitted, names, table, np.full(len(b), 100.0))
 
 

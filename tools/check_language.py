@@ -66,5 +66,5 @@ if __name__ == "__main__":
     roots = [Path(name) for name in sys.argv[1:]] or [Path("src")]
     files = sorted(file for root in roots for file in ([root] if root.is_file() else root.rglob("*.py")))
     lines = [f"{file}:{line}: {fault}" for file in files for line, fault in faults(file)]
-    print(*lines, sep="\n")
+    sys.stdout.writelines(f"{line}\n" for line in lines)
     sys.exit(bool(lines))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from shapespace.cli.command_table import COHORT_SETTINGS, COMMANDS, GROUPS, JSON, QUIET, SET, Command
+from shapespace.cli.command_table import COHORT_SETTINGS, COMMANDS, GROUPS, JSON, QUIET, SET, CommandSpec
 from shapespace.cli.options import Option
 from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS
 
@@ -132,11 +132,11 @@ def with_tests(text: str) -> str:
     return before + BEGIN + table + END + rest.partition(END)[2]
 
 
-def file_name(command: Command) -> str:
+def file_name(command: CommandSpec) -> str:
     return f"{command.name.replace(' ', '-')}.md"
 
 
-def page(command: Command) -> str:
+def page(command: CommandSpec) -> str:
     """Return the page of a command."""
     text = f"# shapespace {command.name}\n\n{command.summary[0].upper()}{command.summary[1:]}.\n\n"
     text += f"```text\n{command.usage}\n```\n\n"

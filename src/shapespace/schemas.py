@@ -125,7 +125,7 @@ class BothWays(Struct, frozen=True, kw_only=True):
     scan_to_model: Distances = Distances()
 
 
-class OverlapDistances(BothWays, frozen=True, kw_only=True):
+class OverlapRecord(BothWays, frozen=True, kw_only=True):
     """Distances over the parts that scan and model both contain.
 
     Args:
@@ -137,7 +137,7 @@ class OverlapDistances(BothWays, frozen=True, kw_only=True):
     scan_covered_share: float | None = None
 
 
-class Pose(Struct, frozen=True, kw_only=True):
+class PoseRecord(Struct, frozen=True, kw_only=True):
     """A similarity x -> scale · rotation · x + translation."""
 
     scale: float
@@ -229,13 +229,13 @@ class FitRecord(Struct, frozen=True, kw_only=True):
     status: Status | Literal["unreadable"]
     reason: str = ""
     reasons: tuple[ReasonRecord, ...] = ()
-    shown: OverlapDistances | None = None
-    shown_dense: OverlapDistances | None = None
+    shown: OverlapRecord | None = None
+    shown_dense: OverlapRecord | None = None
     method: str = ""
     config: Mapping[str, Any] = {}
     start: str | None = None
     notes: tuple[str, ...] = ()
-    T_scan_model: Pose | None = None
+    T_scan_model: PoseRecord | None = None
     mm_per_scan_unit: float | None = None
     size_mm: float | None = None
     n_vertices: int | None = None

@@ -12,7 +12,7 @@ from shapespace.batch.executors import EXECUTORS, ExecutionConfig, Local, Serial
 from shapespace.commands.quality import QualityRunner, QualityWork
 from shapespace.errors import FitError
 from shapespace.io import memory_cache
-from shapespace.model.model_quality import Curve, ModelQuality, Part, QualityConfig, Shapes, measure_quality
+from shapespace.model.model_quality import Curve, ModelQuality, QualityConfig, QualityTask, Shapes, measure_quality
 from shapespace.types import Mesh
 from synthetic_shapes import blob_model
 
@@ -66,7 +66,7 @@ def test_a_part_that_no_worker_survives_ends_in_a_sentence(
     meshes: list[Mesh], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Lost(Serial):
-        def run(self, work: Any, tasks: Sequence[Part], /) -> Any:
+        def run(self, work: Any, tasks: Sequence[QualityTask], /) -> Any:
             return nullcontext((task, work.give_up(task, "its worker ended by signal 9")) for task in tasks)
 
     monkeypatch.setitem(EXECUTORS, "serial", lambda *_: Lost())

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from shapespace.batch.executors import Executor, Local, Serial
-from shapespace.batch.fit_work import Job
+from shapespace.batch.fit_work import FitJob
 from shapespace.batch.on_dask import OnDask
 from shapespace.batch.run import BatchConfig, FolderSink, Plan, fit_many, make_jobs
 from shapespace.errors import FileError
@@ -59,10 +59,10 @@ def table(folder: Path) -> list[dict[str, str]]:
 
 
 def fit_into(
-    folder: Path, jobs: Sequence[Job], model: ShapeModel, config: FitConfig = CONFIG, *,
+    folder: Path, jobs: Sequence[FitJob], model: ShapeModel, config: FitConfig = CONFIG, *,
     file: Path = Path("blob.h5"), executor: Executor | None = None, stages: bool = False, reuse: bool = False,
     on_plan: Callable[[Plan], None] | None = None,
-    on_done: Callable[[Job, FitRecord], None] | None = None,
+    on_done: Callable[[FitJob, FitRecord], None] | None = None,
     on_state: Callable[[IcpState], None] | None = None,
 ) -> list[FitRecord]:  # fmt: skip
     """Fit `jobs` into a folder, and return their records."""
@@ -93,7 +93,7 @@ def test_bad_scans_become_rows_and_the_others_go_on(model: ShapeModel, scans: li
 def test_an_interruption_loses_nothing_that_was_done(
     model: ShapeModel, scans: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def stop(job: Job, record: FitRecord) -> None:
+    def stop(job: FitJob, record: FitRecord) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -223,13 +223,13 @@ def test_a_scan_given_twice_is_fitted_once(
 
 def count_fits(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     calls: list[str] = []
-    original = Job.readable
+    original = FitJob.readable
 
-    def noted(job: Job) -> AbstractContextManager[Path]:
+    def noted(job: FitJob) -> AbstractContextManager[Path]:
         calls.append(job.name)
         return original(job)
 
-    monkeypatch.setattr(Job, "readable", noted)
+    monkeypatch.setattr(FitJob, "readable", noted)
     return calls
 
 
@@ -275,7 +275,7 @@ def test_damaged_records_of_earlier_runs_do_not_stop_a_fit(
 def test_an_interruption_waits_for_what_runs_and_the_table_has_it(
     model: ShapeModel, model_path: Path, scans: list[Path], tmp_path: Path
 ) -> None:
-    def stop(job: Job, record: FitRecord) -> None:
+    def stop(job: FitJob, record: FitRecord) -> None:
         raise KeyboardInterrupt
 
     many = [tmp_path / f"s{k}.ply" for k in range(12)]
@@ -315,7 +315,7 @@ def test_reuse_removes_nothing_that_is_valid(
     # Of another scan it would be wrong.
     scan = tmp_path / "scan0.ply"
     scan.write_bytes(scans[1].read_bytes())
-    fit_into(tmp_path, [Job("scan0", scan)], model, reuse=True)
+    fit_into(tmp_path, [FitJob("scan0", scan)], model, reuse=True)
     assert not (tmp_path / "scan0.dense.ply").exists() and not (tmp_path / "scan0.stages.npz").exists()
 
 

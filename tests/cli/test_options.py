@@ -13,7 +13,7 @@ import pytest
 from conftest import Run
 from shapespace import cli
 from shapespace.cli import command_table
-from shapespace.cli.command_table import COMMANDS, Command
+from shapespace.cli.command_table import COMMANDS, CommandSpec
 from shapespace.cli.options import NO_DEFAULT, Option, Source
 
 SOURCES = [value for value in vars(command_table).values() if isinstance(value, Source)]
@@ -55,7 +55,7 @@ def test_fields_read_from_source_text_are_those_of_the_imported_class_or_functio
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
-def test_help_lists_at_most_ten_options_and_help_all_the_others(command: Command) -> None:
+def test_help_lists_at_most_ten_options_and_help_all_the_others(command: CommandSpec) -> None:
     basic = [o for o in command.options if o.basic and not o.is_positional]
     every = [o for o in command.options if not o.is_positional]
     assert len(basic) <= MOST_BASIC
@@ -67,7 +67,7 @@ def test_help_lists_at_most_ten_options_and_help_all_the_others(command: Command
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
-def test_every_option_has_a_help_text(command: Command) -> None:
+def test_every_option_has_a_help_text(command: CommandSpec) -> None:
     assert all(option.text for option in (*command.options, *command.settings))
 
 

@@ -7,13 +7,13 @@ from typing import get_type_hints
 
 import pytest
 
-from shapespace.cli.command_table import COMMANDS, Command
+from shapespace.cli.command_table import COMMANDS, CommandSpec
 from shapespace.cli.printing import show_outcome
 from shapespace.commands.outcome import Aside, Outcome, exit_code_of, first_lines
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
-def test_each_parameter_of_a_command_is_an_option(command: Command) -> None:
+def test_each_parameter_of_a_command_is_an_option(command: CommandSpec) -> None:
     function = resolve_name(f"shapespace.{command.run}")
     kinds = get_type_hints(function)
     options = (*command.options, *command.settings)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from shapespace.batch.fit_records import coefficient_row, read_record, write_coefficients
-from shapespace.cohort.cohort import Cohort, Fitted, ShapeSource, with_columns
+from shapespace.cohort.cohort import Cohort, FitDiagnostics, ShapeSource, with_columns
 from shapespace.cohort.read import CohortConfig, read_cohort
 from shapespace.cohort.table import Table
 from shapespace.errors import CorrespondenceError, FileError, FileFormatError, InputError
@@ -37,12 +37,12 @@ def apart(mine: FloatArray, other: FloatArray) -> float:
     return float(np.abs(pairwise(mine) - pairwise(other)).max())
 
 
-def fitted_of(given: ShapeModel, n: int = COUNT, seed: int = 0, modes: int | None = None) -> Fitted:
+def fitted_of(given: ShapeModel, n: int = COUNT, seed: int = 0, modes: int | None = None) -> FitDiagnostics:
     b = (
         np.random.default_rng(seed).standard_normal((n, modes or given.n_modes))
         * given.stddev[: modes or given.n_modes]
     )
-    return Fitted(given, b, np.full(b.shape, 0.1), ("converged",) * n, "fits")
+    return FitDiagnostics(given, b, np.full(b.shape, 0.1), ("converged",) * n, "fits")
 
 
 def blank(n: int) -> tuple[tuple[str, ...], Table]:

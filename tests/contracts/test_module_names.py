@@ -1,5 +1,6 @@
 """Modules are named after their content, once."""
 
+import ast
 import re
 from collections import Counter
 from pathlib import Path
@@ -9,6 +10,8 @@ import shapespace
 ROOT = Path(shapespace.__file__).parent
 # A command is a module of its own, named as the user types it.
 NAMED_AFTER_COMMANDS = {"commands", "cli"}
+# Names of the public interface and of the templates: a cohort's covariates and a page's table, numbers and classes.
+NAMESAKES = {"Predictions": {"predictions", "predictor"}, "Table": {"table", "blocks"}}
 
 
 def test_no_two_modules_have_the_same_name() -> None:
@@ -33,3 +36,12 @@ def test_the_architecture_page_names_every_module_in_the_row_of_its_folder() -> 
         here = {path.stem for place in places for path in [*place.glob("*.py"), place.with_suffix(".py")]}
         first_words = set(re.findall(r"`(\w+)`", re.sub(r"\([^)]*\)", "", modules))) - here
         assert first_words - {"check", "info", "figures"} == set(), folders
+
+
+def test_no_two_classes_have_the_same_name() -> None:
+    places: dict[str, set[str]] = {}
+    for path in ROOT.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                places.setdefault(node.name, set()).add(path.stem)
+    assert {name: found for name, found in places.items() if len(found) > 1} == NAMESAKES

@@ -12,7 +12,7 @@ from shapespace.correspondence import groupwise
 from shapespace.correspondence.register import ElasticSettings
 from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.errors import InputError
-from shapespace.geometry.mirror_plane import Sides
+from shapespace.geometry.mirror_plane import ScanSides
 from shapespace.types import FloatArray, Mesh, Similarity
 from synthetic_shapes import sphere
 
@@ -64,7 +64,7 @@ def test_a_scan_rotated_beyond_the_range_is_excluded_with_the_reason() -> None:
 
 def test_frames_cannot_be_used_where_the_template_is_reflected(monkeypatch: pytest.MonkeyPatch) -> None:
     scans = [raw_blob(k, T=turned(0.0, (1, 0, 0)), points=700).scan for k in range(4)]
-    sides = Sides(np.array([True, True, True, False]), np.ones(4), decided=True)
+    sides = ScanSides(np.array([True, True, True, False]), np.ones(4), decided=True)
     monkeypatch.setattr(groupwise, "solve_sides", lambda *_: sides)
     with pytest.raises(InputError, match="the first template is a mirror image of most scans"):
         ss.correspond(scans, replace(CONFIG, mirror="auto"))

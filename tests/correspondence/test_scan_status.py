@@ -14,7 +14,7 @@ from shapespace.cli import main
 from shapespace.correspondence import groupwise
 from shapespace.correspondence.groupwise import FinishedCorrespondence, add_scans, correspond
 from shapespace.correspondence.register import ElasticSettings
-from shapespace.correspondence.scan_status import Judgement, ScanEvidence, judge
+from shapespace.correspondence.scan_status import Judgement, SurfaceEvidence, judge
 from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.geometry.mirror_plane import mirror_image
 from shapespace.io.meshes.mesh_io import write_mesh
@@ -25,7 +25,7 @@ CONFIG = CorrespondConfig(vertices=300, rounds=2, mirror="never", first=QUICK, n
 BLOBS = [raw_blob(k, points=700) for k in range(8)]
 MIRRORED = 2
 DOUBTED = 0.9  # probability of a right surface below which it is doubtful
-SURE = ScanEvidence(relief_agreement=1.3, usual_relief_agreement=1.3, consensus_deg=3.0)
+SURE = SurfaceEvidence(relief_agreement=1.3, usual_relief_agreement=1.3, consensus_deg=3.0)
 
 
 def test_a_surface_that_nothing_contradicts_has_converged() -> None:
@@ -72,9 +72,9 @@ def test_build_leaves_doubtful_surfaces_out_with_a_note_and_includes_them_on_req
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Rounding differs between platforms, so the status is set here; how it is determined is tested above.
-    seen: list[ScanEvidence] = []
+    seen: list[SurfaceEvidence] = []
 
-    def judge_one(evidence: ScanEvidence) -> Judgement:
+    def judge_one(evidence: SurfaceEvidence) -> Judgement:
         seen.append(evidence)
         return judge(replace(SURE, relief_agreement=0.3)) if len(seen) == MIRRORED + 1 else judge(SURE)
 
@@ -115,5 +115,5 @@ def test_limbs_that_can_be_assigned_otherwise_make_a_surface_doubtful() -> None:
 
 def test_a_relief_that_agrees_well_is_no_doubt_where_others_agree_even_better() -> None:
     usual, well, less = np.arctanh([0.97, 0.92, 0.8]).tolist()
-    assert judge(ScanEvidence(relief_agreement=well, usual_relief_agreement=usual)).status == "converged"
-    assert judge(ScanEvidence(relief_agreement=less, usual_relief_agreement=usual)).status == "doubtful"
+    assert judge(SurfaceEvidence(relief_agreement=well, usual_relief_agreement=usual)).status == "converged"
+    assert judge(SurfaceEvidence(relief_agreement=less, usual_relief_agreement=usual)).status == "doubtful"

@@ -26,7 +26,7 @@ import pytest
 from PIL import Image
 
 from shapespace import cli
-from shapespace.cli.command_table import COHORT_SETTINGS, COMMANDS, JSON, QUIET, SET, Command
+from shapespace.cli.command_table import COHORT_SETTINGS, COMMANDS, JSON, QUIET, SET, CommandSpec
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENTS = [
@@ -543,7 +543,7 @@ def test_the_pages_of_commands_are_those_of_the_parser() -> None:
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.name)
-def test_the_reference_has_every_option_of_the_parser_and_no_other(command: Command) -> None:
+def test_the_reference_has_every_option_of_the_parser_and_no_other(command: CommandSpec) -> None:
     text = (ROOT / "docs" / "cli" / f"{command.name.replace(' ', '-')}.md").read_text("utf-8")
     cells = [line.split(" | ")[0] for line in text.splitlines() if line.startswith("| `-")]
     of_all = (JSON, QUIET, SET)  # the index describes them

@@ -10,7 +10,7 @@ from shapespace.errors import FileFormatError, FitError, InputError, ModelFileEr
 from shapespace.fit.fit_scan import FitConfig, FitResult, fit_scan
 from shapespace.fit.iteration_state import UNSEEN
 from shapespace.io.landmarks.landmark_io import read_region
-from shapespace.model.region import Part
+from shapespace.model.region import ModelRegion
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh
 from synthetic_shapes import Raw, blob_model, raw_scan, similarity
@@ -76,7 +76,7 @@ def test_what_the_region_does_not_tell_is_as_uncertain_as_before() -> None:
 
 
 def test_one_coefficient_vector_stands_for_the_same_shape_in_part_and_whole() -> None:
-    part = Part.of(MODEL, FRONT)
+    part = ModelRegion.of(MODEL, FRONT)
     z = np.array([0.5, -1.0, 0.7, 0.2, -0.4])
     np.testing.assert_allclose(
         part.model.reconstruct(z * part.model.stddev),

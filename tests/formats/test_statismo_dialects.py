@@ -32,12 +32,12 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Read files that are known to be harmless without a process for each; test_sandbox reads in one."""
 
     def read(path: Path, leave: tuple[str, ...] = ()) -> Any:
-        from shapespace.io.sandbox import Tree
+        from shapespace.io.sandbox import FileContent
 
         found = sandbox_child._FileContent(2**26)
         with h5py.File(path) as file:
             sandbox_child._walk(file, "", found, leave)
-        return Tree(found.arrays, found.texts, found.attributes, tuple(found.groups))
+        return FileContent(found.arrays, found.texts, found.attributes, tuple(found.groups))
 
     monkeypatch.setattr("shapespace.formats.statismo.read_hdf5_sandboxed", read)
 

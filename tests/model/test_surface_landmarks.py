@@ -19,7 +19,7 @@ from shapespace.geometry.normals import rms_size
 from shapespace.io.containers.hdf5 import read_hdf5, write_hdf5
 from shapespace.io.landmarks.landmark_io import read_landmark_indices, read_surface_landmarks, write_surface_landmarks
 from shapespace.model.additive import AdditiveModel
-from shapespace.model.region import Part
+from shapespace.model.region import ModelRegion
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh, SurfaceLandmarks
 from synthetic_shapes import blob_model, training_meshes
@@ -225,7 +225,7 @@ def test_a_landmark_goes_where_its_triangle_is_cut_away_and_not_otherwise(
         vertices[gone if k > 1 else []] = np.nan
         holed.append(mesh.with_vertices(vertices))
     seldom = ShapeModel.fit(holed, modes=2, landmarks=landmarks)
-    region = Part.of(model, tuple(np.flatnonzero(inside).tolist())).model
+    region = ModelRegion.of(model, tuple(np.flatnonzero(inside).tolist())).model
     for part in (seldom, region):
         assert list(part.landmarks) == left and part.n_vertices == VERTICES - 1
     for name in left:

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from shapespace.cohort.cohort import Cohort, Fitted
+from shapespace.cohort.cohort import Cohort, FitDiagnostics
 from shapespace.cohort.table import Table
 from shapespace.datasets.faces import load_faces
 from shapespace.datasets.organs import Organ, raw_surface
@@ -147,7 +147,7 @@ def test_what_fits_know_of_themselves_makes_intervals_that_hold_the_truth(thing:
 
     def measured(b: np.ndarray) -> AsymmetryScores:
         names = [f"fit {k}" for k in range(len(b))]
-        fitted = Fitted(model, read_only(b), read_only(stddev), ("converged",) * len(b), "fits")
+        fitted = FitDiagnostics(model, read_only(b), read_only(stddev), ("converged",) * len(b), "fits")
         cohort = Cohort.of_fits(fitted, names, Table({}, tuple(names)), read_only(np.full(len(b), np.nan)))
         return measure_asymmetry(cohort, permutations=0).scores
 

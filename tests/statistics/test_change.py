@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from shapespace.cohort.cohort import Cohort, Fitted
+from shapespace.cohort.cohort import Cohort, FitDiagnostics
 from shapespace.cohort.table import Table
 from shapespace.errors import InputError
 from shapespace.geometry.normals import enclosed_volume, face_vectors, vertex_areas, vertex_normals
@@ -272,7 +272,7 @@ def fitted_pairs(subjects: int, stddev_mm: float, stated_mm: float) -> Cohort:
     b = true + stddev_mm * rng.standard_normal(true.shape)
     names = tuple(f"scan {k}" for k in range(len(b)))
     stated = np.full(b.shape, stated_mm)
-    fitted = Fitted(model, b, stated, ("converged",) * len(b), "out")
+    fitted = FitDiagnostics(model, b, stated, ("converged",) * len(b), "out")
     columns = {
         "subject": tuple(f"s{k // 2}" for k in range(len(b))),
         "visit": tuple(("before", "after")[k % 2] for k in range(len(b))),

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shapespace.cohort.cohort import Cohort, Fitted
+from shapespace.cohort.cohort import Cohort, FitDiagnostics
 from shapespace.cohort.table import Table
 from shapespace.errors import InputError
 from shapespace.geometry.normals import vertex_normals
@@ -617,7 +617,7 @@ def fits_with_a_bump(mm: float, seed: int = 0) -> tuple[Cohort, FloatArray]:
     shapes: FloatArray = points + np.einsum("nk,vk->nv", rng.normal(size=(60, 3)) * 4, smooth)[..., None] * [0, 0, 1]
     shapes += rng.normal(size=shapes.shape) * 0.3 + mm * (group[:, None] * near)[..., None] * [0, 0, 1]
     b = (shapes - model.mean_vertices).reshape(60, -1) @ model.vertex_basis
-    fitted = Fitted(model, b, np.full_like(b, 0.1), ("converged",) * 60, "")
+    fitted = FitDiagnostics(model, b, np.full_like(b, 0.1), ("converged",) * 60, "")
     names = tuple(f"p{k}" for k in range(60))
     table = Table({"group": tuple("ab"[k] for k in group)}, names)
     return Cohort.of_fits(fitted, names, table, np.full(60, np.nan)), near

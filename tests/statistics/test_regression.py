@@ -10,7 +10,7 @@ import pytest
 from sklearn.decomposition import PCA
 from sklearn.linear_model import LinearRegression, Ridge
 
-from shapespace.cohort.cohort import Cohort, Fitted
+from shapespace.cohort.cohort import Cohort, FitDiagnostics
 from shapespace.cohort.table import Table, numbers_as_text
 from shapespace.errors import CorrespondenceError, FileFormatError, InputError
 from shapespace.model.shape_model import ShapeModel
@@ -324,7 +324,7 @@ def test_what_lies_outside_is_said(learned: RegressionResult) -> None:
 def fits(rng: np.random.Generator, model: ShapeModel, n: int) -> Cohort:
     b = rng.standard_normal((n, model.n_modes)) * model.stddev
     names = [f"fit {k}" for k in range(n)]
-    fitted = Fitted(model, read_only(b), read_only(0.1 * np.ones_like(b)), ("converged",) * n, "fits")
+    fitted = FitDiagnostics(model, read_only(b), read_only(0.1 * np.ones_like(b)), ("converged",) * n, "fits")
     table = Table({"age": numbers_as_text(b[:, 0])}, tuple(names))
     return Cohort.of_fits(fitted, names, table, read_only(np.full(n, np.nan)))
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from shapespace.cli import main
-from shapespace.cohort.cohort import Cohort, Fitted
+from shapespace.cohort.cohort import Cohort, FitDiagnostics
 from shapespace.cohort.read import CohortConfig, read_cohort
 from shapespace.cohort.table import Table
 from shapespace.errors import CorrespondenceError, InputError
@@ -41,7 +41,7 @@ def population(
     seen = told * b + np.sqrt(told * (1 - told)) * SPREAD * rng.standard_normal(b.shape)
     names = tuple(f"{name}{k}" for k in range(n))
     beyond = rng.gamma(5.0, 0.1, n)
-    fitted = Fitted(model(), seen, np.sqrt(1 - told) * SPREAD, ("converged",) * n, "fits", beyond)
+    fitted = FitDiagnostics(model(), seen, np.sqrt(1 - told) * SPREAD, ("converged",) * n, "fits", beyond)
     return Cohort.of_fits(fitted, names, Table({}, names), np.full(n, np.nan))
 
 
@@ -170,7 +170,7 @@ def test_repeated_scans_of_a_person_count_once_and_leave_together() -> None:
     assert people.fitted is not None
     b = np.repeat(people.fitted.b, 5, axis=0) + 0.01 * SPREAD * rng.standard_normal((60, MODES))
     who = tuple(f"p{k // 5}" for k in range(60))
-    fitted = Fitted(model(), b, np.full(b.shape, 1e-3), ("converged",) * 60, "fits")
+    fitted = FitDiagnostics(model(), b, np.full(b.shape, 1e-3), ("converged",) * 60, "fits")
     names = tuple(f"scan{k}" for k in range(60))
     reference = Cohort.of_fits(fitted, names, Table({"who": who}, names), np.full(60, np.nan))
     subjects = replace(population(2, rng, name="s"), table=Table({"who": ("a", "b")}, ("s0", "s1")))

@@ -26,7 +26,7 @@ from viewer_world import (
     waits,
 )
 
-from shapespace.batch.fit_work import Job, fit_file
+from shapespace.batch.fit_work import FitJob, fit_file
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.fit.fit_scan import FitConfig
 from shapespace.io.meshes.mesh_io import read_mesh
@@ -35,7 +35,7 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.viewer.fitting import Upload, fit_upload
 from shapespace.viewer.model_view import ModelView, without_folders
 from shapespace.viewer.serve import listen, page_address, serve
-from shapespace.viewer.uploaded_scans import Limits
+from shapespace.viewer.uploaded_scans import UploadLimits
 
 __all__ = ["model", "scan_file", "start"]
 
@@ -62,7 +62,7 @@ def test_a_dropped_scan_is_fitted_as_the_command_line_does(
     assert verdict["status"] == "converged" and verdict["pictured"]
     assert 0 < verdict["shown"]["model_to_scan"]["mean"] < 1 and verdict["shown"]["model_seen_share"] > 0.9
 
-    fit_file(Job("cli", scan_file), model, Path("blobs.h5"), tmp_path, FitConfig(), stages=True)
+    fit_file(FitJob("cli", scan_file), model, Path("blobs.h5"), tmp_path, FitConfig(), stages=True)
     expected = json.loads((tmp_path / "cli.fit.json").read_text())
     record = user.get(f"/api/scans/{key}/record").json()
     for one in (record, expected):
@@ -199,7 +199,7 @@ def test_a_fit_that_takes_too_long_is_stopped(start: Start) -> None:
 
 
 def test_nothing_is_left_when_the_server_ends(model: ShapeModel) -> None:
-    with running(ModelView(model, "m.h5"), Limits(), waits) as viewer:
+    with running(ModelView(model, "m.h5"), UploadLimits(), waits) as viewer:
         user = viewer.user()
         key = upload(user, b"x").json()["id"]
         assert oct(viewer.root.stat().st_mode)[-3:] == oct((viewer.root / key).stat().st_mode)[-3:] == "700"
@@ -333,7 +333,7 @@ def fits(model: ShapeModel, scan_file: Path, tmp_path: Path) -> Path:
     folder.mkdir()
     (tmp_path / "empty.ply").write_bytes(b"")
     for name, file, stages in (("a", scan_file, True), ("b", scan_file, False), ("c", tmp_path / "empty.ply", True)):
-        fit_file(Job(name, file), model, tmp_path / "model.h5", folder, FitConfig(), stages=stages)
+        fit_file(FitJob(name, file), model, tmp_path / "model.h5", folder, FitConfig(), stages=stages)
     (folder / "d.fit.json").write_text("{")
     return folder
 

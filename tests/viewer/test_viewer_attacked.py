@@ -14,7 +14,7 @@ from viewer_world import Start, agrees, model, sentence, start, until, upload
 from shapespace.model.shape_model import ShapeModel
 from shapespace.viewer import serve as serve_module
 from shapespace.viewer.model_view import ModelView
-from shapespace.viewer.uploaded_scans import Limits, Scans
+from shapespace.viewer.uploaded_scans import Scans, UploadLimits
 
 __all__ = ["model", "start"]
 
@@ -144,7 +144,7 @@ def test_a_full_disk_is_one_sentence_and_does_not_fill_the_queue(start: Start, m
 
 
 def test_the_documentation_states_the_limits() -> None:
-    limits = Limits()
+    limits = UploadLimits()
     text = (Path(__file__).parents[2] / "docs" / "viewer.md").read_text(encoding="utf-8")
     rows = [line for line in text.partition("## Limits")[2].split("\n## ")[0].splitlines() if line[:1] == "|"]
     numbers = [int(number) for row in rows[2:] for number in re.findall(r"\d+", row.split("|")[2])]

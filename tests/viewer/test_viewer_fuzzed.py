@@ -25,7 +25,7 @@ from shapespace.viewer.corresponding_surfaces import Surfaces
 from shapespace.viewer.guard import Access
 from shapespace.viewer.model_view import ModelView
 from shapespace.viewer.server import make_app, make_surfaces_app
-from shapespace.viewer.uploaded_scans import Limits, Scans
+from shapespace.viewer.uploaded_scans import Scans, UploadLimits
 from synthetic_shapes import blob_model
 
 BY_HAND = int(os.environ.get("SHAPESPACE_FUZZ", "0"))
@@ -77,7 +77,7 @@ def fits(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Target]:
     with ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
         patch.setattr(scans_module, "run_worker", lambda *_: "It was not fitted.")
         access = Access()
-        scans = Scans(Path(tmp_path_factory.mktemp("scans")), model, "m.h5", Limits(upload_bytes=5000))
+        scans = Scans(Path(tmp_path_factory.mktemp("scans")), model, "m.h5", UploadLimits(upload_bytes=5000))
         stack.callback(scans.close)
         yield stack.enter_context(target(make_app(ModelView(model, "m.h5", folder), scans, access), access))
 

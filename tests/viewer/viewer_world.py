@@ -25,7 +25,7 @@ from shapespace.viewer.guard import Access
 from shapespace.viewer.model_view import ModelView
 from shapespace.viewer.serve import make_server
 from shapespace.viewer.server import make_app
-from shapespace.viewer.uploaded_scans import Limits, Scans
+from shapespace.viewer.uploaded_scans import Scans, UploadLimits
 from synthetic_shapes import blob_model, raw_scan, similarity
 
 VERTICES = 400
@@ -102,7 +102,7 @@ def served(app: Any) -> Iterator[str]:
 
 
 @contextmanager
-def running(view: ModelView, limits: Limits, worker: Worker, loopback: bool = True) -> Iterator[Running]:
+def running(view: ModelView, limits: UploadLimits, worker: Worker, loopback: bool = True) -> Iterator[Running]:
     access = Access()
     with tempfile.TemporaryDirectory() as root, ExitStack() as clients:
         scans = Scans(Path(root), view.model, view.model_name, limits, worker=worker)
@@ -130,7 +130,7 @@ def start(model: ShapeModel) -> Iterator[Start]:
             **limits: Any,
         ) -> Running:
             view = view or ModelView(model, "blobs.h5")
-            return stack.enter_context(running(view, Limits(**limits), worker, loopback))
+            return stack.enter_context(running(view, UploadLimits(**limits), worker, loopback))
 
         yield start
 

@@ -15,8 +15,7 @@ import numpy as np
 from msgspec import structs
 
 from shapespace.errors import FileFormatError
-from shapespace.fit.result import FitResult, stage_arrays
-from shapespace.fit.result import OverlapDistances as FitOverlap
+from shapespace.fit.result import FitResult, OverlapDistances, stage_arrays
 from shapespace.geometry.closest import SurfaceDistances
 from shapespace.geometry.normals import face_areas, rms_size
 from shapespace.io.files import atomic_path, sha256_of_file, write_bytes, write_text
@@ -31,8 +30,8 @@ from shapespace.schemas import (
     FitRecord,
     FoundLandmark,
     Iteration,
-    OverlapDistances,
-    Pose,
+    OverlapRecord,
+    PoseRecord,
     ReasonRecord,
 )
 from shapespace.store.results import json_at
@@ -122,7 +121,7 @@ def fit_record(
         config=dict(result.config),
         start=result.start,
         notes=tuple(result.notes),
-        T_scan_model=Pose(scale=T.scale, rotation=T.rotation.tolist(), translation=T.translation.tolist()),
+        T_scan_model=PoseRecord(scale=T.scale, rotation=T.rotation.tolist(), translation=T.translation.tolist()),
         mm_per_scan_unit=result.mm_per_scan_unit,
         **_size_of_surface(result),
         b=tuple(result.b.tolist()),
@@ -171,19 +170,19 @@ def _found_landmarks(result: FitResult) -> dict[str, FoundLandmark]:
     }
 
 
-def _both_ways(distances: SurfaceDistances | FitOverlap) -> dict[str, Distances]:
+def _both_ways(distances: SurfaceDistances | OverlapDistances) -> dict[str, Distances]:
     return {
         direction: Distances(**asdict(getattr(distances, direction)))
         for direction in ("model_to_scan", "scan_to_model")
     }
 
 
-def _overlap(result: FitResult, stage: str) -> OverlapDistances | None:
+def _overlap(result: FitResult, stage: str) -> OverlapRecord | None:
     """Return the overlap distances at a stage; None if the fit has no such stage."""
     if stage not in result.stages:
         return None
     overlap = result.overlap_distances_at(stage)
-    return OverlapDistances(
+    return OverlapRecord(
         **_both_ways(overlap),
         model_seen_share=overlap.model_seen_share,
         scan_covered_share=overlap.scan_covered_share,

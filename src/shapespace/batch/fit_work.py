@@ -47,7 +47,7 @@ from shapespace.types import FloatArray, Mesh
 
 
 @dataclass(frozen=True)
-class Job:
+class FitJob:
     """One scan to fit.
 
     Args:
@@ -99,7 +99,7 @@ class Job:
 
 
 def fit_file(
-    job: Job,
+    job: FitJob,
     model: ShapeModel,
     model_file: Path,
     folder: Path,
@@ -131,7 +131,7 @@ def publish(result: FitResult, record: FitRecord, name: str, folder: Path, *, st
     write_together(writes, _find_stale(files, dense=not dense, stages=not stages, landmarks=not texts))
 
 
-def _write_failed(record: FitRecord, job: Job, folder: Path) -> FitRecord:
+def _write_failed(record: FitRecord, job: FitJob, folder: Path) -> FitRecord:
     files = _files(job.name, folder)
     # The surface of an earlier run would contradict the record.
     stale = [files["fitted"], *_find_stale(files, dense=True, stages=True, landmarks=True)]
@@ -168,7 +168,7 @@ def naming(source: Path | str, sentence: str) -> str:
 class FitTask:
     """Task for one scan: its job, the settings, whether to write the stages, and whether to reuse valid results."""
 
-    job: Job
+    job: FitJob
     config: FitConfig
     stages: bool
     resume: bool
@@ -256,7 +256,7 @@ _model = LatestValue[ShapeModel]()
 """The model of the batch that this process works on, by its content hash."""
 
 
-def has_surface(job: Job, folder: Path) -> bool:
+def has_surface(job: FitJob, folder: Path) -> bool:
     """Return whether `folder` contains the surface of an earlier fit of the scan."""
     files = _files(job.name, folder)
     return files["fitted"].is_file() and files["record"].is_file()
@@ -310,7 +310,7 @@ def is_fit_of(identity: str, recorded: File, task: FitTask, model_hash: str, fol
     return identity == wanted and is_same_scan(recorded, task.job, folder)
 
 
-def is_same_scan(recorded: File, job: Job, folder: Path) -> bool:
+def is_same_scan(recorded: File, job: FitJob, folder: Path) -> bool:
     """Return whether the scan of `job` is that of a result in `folder`.
 
     Scans are compared by path, size and modification time, or else by content; remote scans by version.

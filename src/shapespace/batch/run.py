@@ -17,7 +17,7 @@ from msgspec import structs
 
 from shapespace.batch.executors import Executor, Serial
 from shapespace.batch.fit_records import write_record
-from shapespace.batch.fit_work import FitTask, FitWork, Job, has_surface, is_fit_of, resumed
+from shapespace.batch.fit_work import FitJob, FitTask, FitWork, has_surface, is_fit_of, resumed
 from shapespace.batch.result_folder import RECORD, CoefficientTable, names_for, only_writer
 from shapespace.batch.store import Store
 from shapespace.errors import FileError
@@ -83,7 +83,7 @@ class FolderSink:
             return replace(task, resume=False), None
         return task, self.records[task.job.name]
 
-    def has_result(self, job: Job) -> bool:
+    def has_result(self, job: FitJob) -> bool:
         """Return whether there is a surface of an earlier fit of the scan."""
         return has_surface(job, self.folder)
 
@@ -105,7 +105,7 @@ class FolderSink:
         self._table.catch_up([name for name in self._started if name not in self.records])
         self._table.save()
 
-    def _with_metadata(self, record: FitRecord, job: Job) -> FitRecord:
+    def _with_metadata(self, record: FitRecord, job: FitJob) -> FitRecord:
         if not job.metadata or record.metadata == job.metadata:
             return record
         record = structs.replace(record, metadata=dict(job.metadata))
@@ -150,7 +150,7 @@ class StoreSink:
         valid = stored is not None and self._is_valid(stored, task)
         return task, stored[0] if valid and stored is not None else None
 
-    def has_result(self, job: Job) -> bool:
+    def has_result(self, job: FitJob) -> bool:
         """Return whether there is a surface of an earlier fit of the scan."""
         stored = self._stored.get(job.name)
         return stored is not None and stored[0].is_fitted
@@ -199,12 +199,12 @@ def make_jobs(
     landmarks: Path | None = None,
     folder: Path | None = None,
     addresses: Mapping[Path, str] | None = None,
-) -> list[Job]:
+) -> list[FitJob]:
     """Return a job for each scan, named by `names_for` for results in `folder`; equal scans have equal jobs."""
     addresses = addresses or {}
     names = names_for(scans, folder, addresses)
     return [
-        Job(name, scan, landmarks, address=addresses.get(scan, "")) for name, scan in zip(names, scans, strict=True)
+        FitJob(name, scan, landmarks, address=addresses.get(scan, "")) for name, scan in zip(names, scans, strict=True)
     ]
 
 
@@ -259,13 +259,13 @@ class BatchConfig:
 
 
 def fit_many(
-    jobs: Sequence[Job],
+    jobs: Sequence[FitJob],
     config: BatchConfig,
     executor: Executor,
     sink: Sink,
     *,
     on_plan: Callable[[Plan], None] | None = None,
-    on_done: Callable[[Job, FitRecord], None] | None = None,
+    on_done: Callable[[FitJob, FitRecord], None] | None = None,
     on_state: Callable[[IcpState], None] | None = None,
 ) -> Counter[str]:
     """Fit all `jobs` into `sink` and return the number of fits of each status; an interruption loses no finished fit.

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
-from shapespace.cli.command_table import COMMANDS, GROUPS, Command
+from shapespace.cli.command_table import COMMANDS, GROUPS, CommandSpec
 from shapespace.cli.dispatch import run_command
 from shapespace.cli.options import Container, Option, apply_settings
 from shapespace.version import __version__
@@ -43,7 +43,7 @@ class CommandParser(argparse.ArgumentParser):
         **keywords: See `argparse.ArgumentParser`.
     """
 
-    def __init__(self, *, command: Command | None = None, **keywords: Any) -> None:
+    def __init__(self, *, command: CommandSpec | None = None, **keywords: Any) -> None:
         super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, **keywords)
         self._command = command
 

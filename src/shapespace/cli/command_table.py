@@ -71,7 +71,7 @@ GROUPS: Mapping[str, str] = {
 
 
 @dataclass(frozen=True)
-class Command:
+class CommandSpec:
     """A command.
 
     Args:
@@ -219,7 +219,7 @@ _BASIC_OF_TEST = 4
 """First options of a test that `--help` lists, in addition to those of all tests."""
 
 
-def _shape_test(test: ShapeTest) -> Command:
+def _shape_test(test: ShapeTest) -> CommandSpec:
     """Return the command of a test of shape."""
     module, _, function = test.function.partition(".")
     source = Source(f"statistics.shape_tests.{module}", function)
@@ -234,7 +234,7 @@ def _shape_test(test: ShapeTest) -> Command:
         )
         for number, (field, metavar) in enumerate(test.options.items())
     )
-    return Command(
+    return CommandSpec(
         f"test {test.name}", test.summary, (test.example,), "cli.answers:answer_shape_tests",
         (
             *_COHORT,
@@ -246,8 +246,8 @@ def _shape_test(test: ShapeTest) -> Command:
     )  # fmt: skip
 
 
-COMMANDS: tuple[Command, ...] = (
-    Command(
+COMMANDS: tuple[CommandSpec, ...] = (
+    CommandSpec(
         "demo",
         "run both experiments of the paper on simulated faces, ending in a report", ("shapespace demo --quick",),
         "commands.demo:demo",
@@ -263,10 +263,10 @@ COMMANDS: tuple[Command, ...] = (
             "--stages writes them. The scan of James is used if the data set is present. Needs the extra report.",
         ),
     ),
-    Command("data list",
+    CommandSpec("data list",
             "list the open data sets: licence, citation, source, size, hash", ("shapespace data list",),
             "commands.data:data_list"),
-    Command(
+    CommandSpec(
         "data get", "download, verify and convert an open data set", ("shapespace data get ict-facekit",),
         "commands.data:data_get",
         (
@@ -274,7 +274,7 @@ COMMANDS: tuple[Command, ...] = (
             basic("--to", "DIR", "also copy it to DIR/NAME", parse=Path),
         ),
     ),
-    Command(
+    CommandSpec(
         "data faces", "write simulated corresponding faces (PLY) with labels.csv",
         ("shapespace data faces -o faces --subjects 100 --expressions neutral",), "commands.data:write_simulated_faces",
         (
@@ -294,7 +294,7 @@ COMMANDS: tuple[Command, ...] = (
             "licence, which build reads.",
         ),
     ),
-    Command(
+    CommandSpec(
         "data organs", "write simulated organs, smooth as spleens: raw surfaces (PLY), or label volumes",
         ("shapespace data organs -o organs --count 40",), "commands.data:write_simulated_organs",
         (
@@ -305,7 +305,7 @@ COMMANDS: tuple[Command, ...] = (
         ),
         ("Each organ is closed, in mm, with its own triangles and pose; the surfaces are not in correspondence.",),
     ),
-    Command(
+    CommandSpec(
         "data bones", "write simulated bones of two groups: raw scans (PLY), and their table bones.csv",
         ("shapespace data bones -o bones --count 16",), "commands.data:write_simulated_bones",
         (
@@ -319,7 +319,7 @@ COMMANDS: tuple[Command, ...] = (
             "bones.csv has the columns file and group.",
         ),
     ),
-    Command(
+    CommandSpec(
         "data landmarks", "write simulated landmarks of skulls (TPS, 2-D) of two species, and their table skulls.csv",
         ("shapespace data landmarks -o skulls",), "commands.data:write_simulated_landmarks",
         (
@@ -332,7 +332,7 @@ COMMANDS: tuple[Command, ...] = (
             "lines between landmarks of an outline.",
         ),
     ),
-    Command(
+    CommandSpec(
         "surface", "extract surfaces of labels from label volumes (NIfTI, NRRD), as PLY in LPS mm",
         ("shapespace surface masks -o surfaces --label 1", "shapespace fit model.h5 surfaces -o out --unit mm"),
         "commands.surface:write_surfaces",
@@ -351,7 +351,7 @@ COMMANDS: tuple[Command, ...] = (
             "removed, and the others are processed. Needs the extra volumes.",
         ),
     ),
-    Command(
+    CommandSpec(
         "check",
         "check meshes: contents, defects, and their repair before a fit",
         ("shapespace check scan.obj", "shapespace check left_bones -o mirrored --mirror --unit cm",
@@ -371,7 +371,7 @@ COMMANDS: tuple[Command, ...] = (
             "unusable. The exit code is 0 if all files can be used, 1 if some can, 2 if none can.",
         ),
     ),
-    Command(
+    CommandSpec(
         "correspond", "bring raw scans into dense correspondence; no model is needed",
         ("shapespace correspond scans -o same", "shapespace build same -o model.h5",
          "shapespace correspond new_scans --add -o same"),
@@ -424,7 +424,7 @@ COMMANDS: tuple[Command, ...] = (
         ),
         has_workers=True,
     ),
-    Command(
+    CommandSpec(
         "build", "build a shape model from corresponding meshes: Procrustes and PCA",
         ("shapespace build faces/*.ply -o model.h5 --variance 0.98",), "commands.build:build_from_files",
         (
@@ -465,7 +465,7 @@ COMMANDS: tuple[Command, ...] = (
             "alignment or rounding alone are always omitted, and counted.",
         ),
     ),
-    Command(
+    CommandSpec(
         "quality", "measure a shape model: compactness, generalisation, specificity",
         ("shapespace quality faces -o quality",
          "shapespace quality registered_a registered_b --scans scans -o quality"), "commands.quality:quality",
@@ -497,7 +497,7 @@ COMMANDS: tuple[Command, ...] = (
             setting("seed", "S", source=QUALITY),
         ),
     ),
-    Command(
+    CommandSpec(
         "info",
         "print facts of a model, a mesh, a fit, a store or a folder of correspond", ("shapespace info model.h5",),
         "commands.look:info",
@@ -510,7 +510,7 @@ COMMANDS: tuple[Command, ...] = (
             "the file contains, from which their surfaces can be reconstructed.",
         ),
     ),
-    Command(
+    CommandSpec(
         "fit", "fit a model to raw scans: coefficients, pose and fitted surfaces",
         ("shapespace fit model.h5 scan.obj -o out", "shapespace fit model.h5 scans -o out --dense",
          "shapespace build out/*.dense.ply -o new.h5"), "commands.fit:fit",
@@ -560,7 +560,7 @@ COMMANDS: tuple[Command, ...] = (
         ),
         has_workers=True,
     ),
-    Command(
+    CommandSpec(
         "complete", "complete partial scans: the missing part with its uncertainty, and samples of the complete shape",
         ("shapespace complete model.h5 broken.ply -o completed",
          "shapespace complete model.h5 scans -o completed --mirror combined --stl",
@@ -590,7 +590,7 @@ COMMANDS: tuple[Command, ...] = (
         ),
         settings=(_LANDMARK_STDDEV, setting("seed", "S", source=COMPLETION, parse=values.natural)),
     ),
-    Command(
+    CommandSpec(
         "report", "write one HTML report of the fits, correspondence or study in a folder",
         ("shapespace fit model.h5 scans -o out --stages", "shapespace report out"), "commands.answers:report",
         (
@@ -603,7 +603,7 @@ COMMANDS: tuple[Command, ...] = (
         ),
         ("Runs no fit. The report is one file that needs no network. Needs the extra report.",),
     ),
-    Command(
+    CommandSpec(
         "view", "view a shape model, fits, surfaces in correspondence or a project in the browser",
         ("shapespace view model.h5",),
         "cli.pages:view",
@@ -623,7 +623,7 @@ COMMANDS: tuple[Command, ...] = (
         ),
         json=False,
     ),
-    Command(
+    CommandSpec(
         "studio", "do the complete work in the browser: scans, correspondence, model, fits, analyses",
         ("shapespace studio teeth",), "cli.pages:studio",
         (
@@ -643,7 +643,7 @@ COMMANDS: tuple[Command, ...] = (
         json=False,
         defaults={"commands": lambda: summaries_and_options()},
     ),
-    Command(
+    CommandSpec(
         "landmarks transfer", "transfer landmarks from a few marked specimens to all scans in correspondence",
         ("shapespace correspond scans -o same", "shapespace landmarks transfer marked same -o landmarks"),
         "commands.landmarks:transfer_landmarks",
@@ -656,7 +656,7 @@ COMMANDS: tuple[Command, ...] = (
             "reads them.",
         ),
     ),
-    Command(
+    CommandSpec(
         "landmarks convert", "convert landmarks of many specimens between TPS, NTS, MorphoJ, CSV, R and Slicer files",
         ("shapespace landmarks convert skulls.tps -o skulls.csv",
          "shapespace landmarks convert plethodon.rda -o morphoj.txt"), "commands.landmark_data:convert_landmarks",
@@ -675,7 +675,7 @@ COMMANDS: tuple[Command, ...] = (
             "next to OUT as geomorph reads them. Files of R need the extra r.",
         ),
     ),
-    Command(
+    CommandSpec(
         "landmarks check", "check landmark data, or compare landmarks of marked specimens with their prediction",
         ("shapespace landmarks check skulls.tps", "shapespace landmarks check marked same -o check.csv"),
         "commands.landmark_data:check_landmarks",
@@ -694,7 +694,7 @@ COMMANDS: tuple[Command, ...] = (
             "something is to be checked.",
         ),
     ),
-    Command(
+    CommandSpec(
         "landmarks plot", "draw landmarks of all specimens, superimposed around their mean",
         ("shapespace landmarks plot skulls.tps -o skulls.pdf --links links.csv",),
         "commands.landmark_data:plot_configurations",
@@ -706,7 +706,7 @@ COMMANDS: tuple[Command, ...] = (
         ),
         ("Needs the extra report.",),
     ),
-    Command(
+    CommandSpec(
         "landmarks suggest", "name the specimens to mark next",
         ("shapespace landmarks suggest same --marked marked",), "commands.landmarks:suggest_specimens",
         (
@@ -715,7 +715,7 @@ COMMANDS: tuple[Command, ...] = (
             basic("--count", "N", source=LANDMARKS, parse=values.positive),
         ),
     ),
-    Command(
+    CommandSpec(
         "align", "align landmarks by generalised Procrustes analysis, and name specimens to check",
         ("shapespace align skulls.tps --table skulls.csv -o aligned",
          "shapespace compare aligned '~ sex' -o sex"), "cli.answers:answer_align",
@@ -748,7 +748,7 @@ COMMANDS: tuple[Command, ...] = (
             setting("iterations", "N", source=ALIGN, parse=values.positive),
         ),
     ),
-    Command(
+    CommandSpec(
         "recognise train", "train a classifier on fitted scans with labels",
         ("shapespace recognise train out --labels labels.csv -o expressions.skops",
          "shapespace recognise train out --labels labels.csv -o expressions.skops --relative --classifier "
@@ -772,7 +772,7 @@ COMMANDS: tuple[Command, ...] = (
             "cross-validation over subjects is printed. Needs the extra recognise.",
         ),
     ),
-    Command(
+    CommandSpec(
         "recognise predict", "classify fitted scans by a trained classifier, as a CSV table",
         ("shapespace recognise predict expressions.skops out -o predictions.csv",),
         "commands.recognise:recognise_predict",
@@ -790,7 +790,7 @@ COMMANDS: tuple[Command, ...] = (
             "prediction, because its fit failed or its subject has no neutral face, and 2 if no scan has one.",
         ),
     ),
-    Command(
+    CommandSpec(
         "recognise transfer", "transfer the expression of one person to another, from fits by an additive model",
         ("shapespace recognise transfer model.h5 out/anna.fit.json out/ben.fit.json -o anna.ply",),
         "commands.recognise:recognise_transfer",
@@ -802,7 +802,7 @@ COMMANDS: tuple[Command, ...] = (
         ),
         ("Both fits must be by that model, with all its modes.",),
     ),
-    Command(
+    CommandSpec(
         "recognise study", "measure recognition on unseen subjects, ending in a report",
         ("shapespace recognise study --data BU-3DFE --model model.h5 -o study",), "commands.recognise:recognise_study",
         (
@@ -822,7 +822,7 @@ COMMANDS: tuple[Command, ...] = (
         defaults=_GOES_ON,
         settings=(*_EXECUTION_SETTINGS, setting("seed", "S", source=STUDY)),
     ),
-    Command(
+    CommandSpec(
         "recognise verify", "test whether two scans are of one subject: error rates, likelihood ratios",
         ("shapespace recognise verify scans.csv -o verified --gallery session=1",), "cli.answers:answer_verify",
         (
@@ -836,7 +836,7 @@ COMMANDS: tuple[Command, ...] = (
         ),
         settings=_IDENTITY_SETTINGS,
     ),
-    Command(
+    CommandSpec(
         "recognise identify", "identify the subject of a scan among the enrolled ones: ranks and error rates",
         ("shapespace recognise identify scans.csv -o identified --gallery expression=neutral",),
         "cli.answers:answer_identify",
@@ -847,7 +847,7 @@ COMMANDS: tuple[Command, ...] = (
         ),
         settings=_IDENTITY_SETTINGS,
     ),
-    Command(
+    CommandSpec(
         "cohort", "write a cohort file: shapes, table and settings, which all questions about shapes read",
         ("shapespace cohort people.csv --shapes same --gauge form -o bones.toml",
          "shapespace compare bones.toml '~ sex' -o sex"), "cli.answers:answer_cohort",
@@ -863,7 +863,7 @@ COMMANDS: tuple[Command, ...] = (
             "it. A question takes the file in place of a table, and --set changes one of its settings for one answer.",
         ),
     ),
-    Command(
+    CommandSpec(
         "figures", "draw the figures of results as files for a paper",
         ("shapespace figures sex --format svg,pdf", "shapespace figures sex --format png --dpi 600 --views dorsal"),
         "cli.answers:result_figures",
@@ -878,7 +878,7 @@ COMMANDS: tuple[Command, ...] = (
         ),
         ("Writes OUT/figures with captions.txt. Needs the extra report.",),
     ),
-    Command(
+    CommandSpec(
         "compare", "test effects of groups and covariates on shape by linear models",
         ("shapespace compare people.csv '~ sex + age' -o sex-and-age",), "cli.answers:answer_compare",
         (
@@ -905,7 +905,7 @@ COMMANDS: tuple[Command, ...] = (
             setting("seed", "S", source=COMPARE, parse=values.integer),
         ),
     ),
-    Command(
+    CommandSpec(
         "morphospace", "draw shapes on axes of an ordination, and the shape at any place: PCA, CVA, phylogenetic axes",
         ("shapespace morphospace people.csv --group sex -o morphospace",
          "shapespace morphospace species.tps --tree species.nwk -o phylomorphospace"), "cli.answers:answer_morphospace",
@@ -924,7 +924,7 @@ COMMANDS: tuple[Command, ...] = (
         settings=_question_settings(),
     ),
     *(_shape_test(test) for test in SHAPE_TESTS),
-    Command(
+    CommandSpec(
         "change", "measure change between visits of the same subjects, in mm, and its noise",
         ("shapespace change visits.csv -o change --order before,after",), "cli.answers:answer_change",
         (
@@ -943,7 +943,7 @@ COMMANDS: tuple[Command, ...] = (
             setting("seed", "S", source=CHANGE, parse=values.integer), without=("gauge", "unit")
         ),
     ),
-    Command(
+    CommandSpec(
         "asymmetry", "measure asymmetry: scores and maps, directional and fluctuating asymmetry",
         ("shapespace asymmetry skulls.csv -o asymmetry --set surfaces=dense",), "cli.answers:answer_asymmetry",
         (
@@ -960,7 +960,7 @@ COMMANDS: tuple[Command, ...] = (
         ),
         settings=_question_settings(setting("seed", "S", source=ASYMMETRY, parse=values.integer)),
     ),
-    Command(
+    CommandSpec(
         "regress", "predict a number, such as age, from shape, or the mean shape along a number, with intervals",
         ("shapespace regress people.csv --target age -o age --predict new.csv",
          "shapespace regress people.csv --along age --at 20,40,60 --covariates sex -o growth"),
@@ -990,7 +990,7 @@ COMMANDS: tuple[Command, ...] = (
             setting("seed", "S", source=REGRESS, parse=values.integer),
         ),
     ),
-    Command(
+    CommandSpec(
         "score", "score new subjects against a reference population: distance, percentile, z-map",
         ("shapespace score patients -o scored --reference controls.csv",), "cli.answers:answer_score",
         (
@@ -1002,7 +1002,7 @@ COMMANDS: tuple[Command, ...] = (
         ),
         settings=_question_settings(setting("seed", "S", source=SCORE, parse=values.integer)),
     ),
-    Command(
+    CommandSpec(
         "export", "export fits as single files or one table, or any cohort to geomorph, MorphoJ, TPS or CSV",
         ("shapespace export out anna ben -o single", "shapespace export out --table fits.csv",
          "shapespace export aligned --to geomorph --formula '~ sex' -o r"), "cli.answers:answer_export",
@@ -1026,7 +1026,7 @@ COMMANDS: tuple[Command, ...] = (
         ),
         settings=_question_settings(),
     ),
-    Command(
+    CommandSpec(
         "convert", "convert a shape model from or to the format of another tool",
         ("shapespace convert femur.h5.json femur.h5", "shapespace convert model.h5 model.bin --to eos"),
         "commands.convert:convert",
@@ -1039,7 +1039,7 @@ COMMANDS: tuple[Command, ...] = (
         ),
         ("Prints what was kept, changed and omitted. Training shapes are always omitted.",),
     ),
-    Command(
+    CommandSpec(
         "cache", "print the folder and size of the cache, or clear it", ("shapespace cache --clear",),
         "commands.cache:cache",
         (basic("--clear", help="remove all entries; fits compute them again"),),

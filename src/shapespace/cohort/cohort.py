@@ -66,7 +66,7 @@ class ShapeSource:
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class FitDiagnostics:
     """Fit diagnostics of a cohort, one row per shape.
 
     Args:
@@ -109,7 +109,7 @@ class Fitted:
         ratio = float((self.model.stddev[:modes] ** 2).sum()) / total if total > 0 else 1.0
         return ShapeSource(kind, modes, ratio)
 
-    def take(self, rows: Sequence[int]) -> Fitted:
+    def take(self, rows: Sequence[int]) -> FitDiagnostics:
         """Return the fits of some rows."""
         indices = np.asarray(rows, dtype=np.intp)
         return replace(
@@ -162,7 +162,7 @@ class Cohort:
     gauge: Gauge = "shape"
     faces: IntArray | None = None
     landmarks: SurfaceLandmarks | None = None
-    fitted: Fitted | None = None
+    fitted: FitDiagnostics | None = None
     notes: tuple[str, ...] = ()
     source: ShapeSource = ShapeSource()
     unit: LengthUnit = "mm"
@@ -532,7 +532,7 @@ class Cohort:
 
     @staticmethod
     def of_fits(
-        fitted: Fitted, names: Sequence[str], table: Table, sizes_mm: FloatArray, gauge: Gauge = "shape"
+        fitted: FitDiagnostics, names: Sequence[str], table: Table, sizes_mm: FloatArray, gauge: Gauge = "shape"
     ) -> Cohort:
         """Return the cohort of fits in the frame of the model, in which their poses are already divided out.
 

@@ -33,7 +33,7 @@ _ANCHOR = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class CompletedShapes:
+class ImputedShapes:
     """Aligned shapes with estimates at missing vertices.
 
     Args:
@@ -57,7 +57,7 @@ def completed_shapes(
     faces: IntArray | None,
     *,
     align: bool,
-) -> CompletedShapes:
+) -> ImputedShapes:
     """Align shapes by generalised Procrustes with missing vertices at their conditional means (see `complete`).
 
     Vertices that fewer than `MIN_SEEN` of the shapes, or fewer than two, observe carry no variation.
@@ -94,7 +94,7 @@ def completed_shapes(
         masked_shapes = np.where(observed[:, :, None], shapes, np.nan)
         posed = np.stack([x if T is None else T.apply(x) for T, x in zip(poses, masked_shapes, strict=True)])
         out[:, ~analysed] = _one_position(posed, completion.shapes.mean(axis=0), analysed, faces)
-    return CompletedShapes(out, sizes, known, analysed)
+    return ImputedShapes(out, sizes, known, analysed)
 
 
 def _check_observed(known: BoolArray, names: Sequence[str]) -> None:

@@ -15,7 +15,7 @@ from typing import Any, Literal, TypeAlias, cast, get_args
 
 import numpy as np
 
-from shapespace.cohort.cohort import SUBJECT, Cohort, Fitted, ShapeSource
+from shapespace.cohort.cohort import SUBJECT, Cohort, FitDiagnostics, ShapeSource
 from shapespace.cohort.landmark_cohort import has_landmarks, landmark_cohort, read_landmark_cohort
 from shapespace.cohort.orientation import find_orientation
 from shapespace.cohort.shape_samples import ENDING, SampleFile, find_samples
@@ -363,7 +363,7 @@ def _cohort_of_results(
     stated = replace(table.take([index for _, index in accepted]), rows=names)
     sizes = read_only([row.size_mm for row in fits])
     width = max(len(row.b) for row in fits)
-    fitted = Fitted(
+    fitted = FitDiagnostics(
         model=model,
         b=read_only([np.pad(row.b, (0, width - len(row.b))) for row in fits]),
         b_stddev=read_only([np.pad(row.b_stddev, (0, width - len(row.b_stddev))) for row in fits]),

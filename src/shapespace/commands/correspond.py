@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import structs
 
 from shapespace.batch.executors import ExecutionConfig
-from shapespace.batch.fit_work import Job
+from shapespace.batch.fit_work import FitJob
 from shapespace.batch.parallel_rounds import RoundRunner
 from shapespace.batch.progress import progress, telling_of_compiling, waiting
 from shapespace.batch.result_folder import names_for, only_writer
@@ -149,7 +149,7 @@ def correspond_groups(
     return summary, records
 
 
-def find_jobs(files: CorrespondFiles, folder: Path, say: Say) -> list[Job]:
+def find_jobs(files: CorrespondFiles, folder: Path, say: Say) -> list[FitJob]:
     """Return the given scans, but for the surfaces of an earlier correspondence, with the names of their results.
 
     Raises:
@@ -164,12 +164,13 @@ def find_jobs(files: CorrespondFiles, folder: Path, say: Say) -> list[Job]:
     paths = [scan.path for scan in scans]
     names = names_for(paths, None, {scan.path: scan.address for scan in scans if scan.address})
     return with_ids(
-        [Job(n, scan.path, scan.landmarks, address=scan.address) for n, scan in zip(names, scans, strict=True)], scans
+        [FitJob(n, scan.path, scan.landmarks, address=scan.address) for n, scan in zip(names, scans, strict=True)],
+        scans,
     )
 
 
 def bring(
-    jobs: Sequence[Job],
+    jobs: Sequence[FitJob],
     read: ScansRead,
     marks: LandmarkFiles,
     files: CorrespondFiles,
@@ -215,7 +216,7 @@ def with_scans(summary: CorrespondenceRecord, records: Sequence[CorrespondRecord
     )
 
 
-def _subjects_of(jobs: Sequence[Job], column: str | None) -> dict[str, str]:
+def _subjects_of(jobs: Sequence[FitJob], column: str | None) -> dict[str, str]:
     """Return the subject of each scan by its name; empty if no column is given.
 
     Raises:
@@ -236,7 +237,7 @@ def _subjects_of(jobs: Sequence[Job], column: str | None) -> dict[str, str]:
 
 
 def inputs_hash_of(
-    jobs: Sequence[Job],
+    jobs: Sequence[FitJob],
     marks: LandmarkFiles,
     files: CorrespondFiles,
     config: CorrespondConfig,
@@ -261,7 +262,7 @@ def inputs_hash_of(
     return hashlib.sha256(content.encode()).hexdigest()
 
 
-def content_hash_of(job: Job) -> str:
+def content_hash_of(job: FitJob) -> str:
     """Return the SHA-256 of the file of a scan."""
     try:
         with job.readable() as file:
@@ -314,7 +315,7 @@ class ScansRead:
 
 
 def read_scans(
-    jobs: Sequence[Job], marks: LandmarkFiles, *, strict: bool, outer: bool, quiet: bool, say: Say
+    jobs: Sequence[FitJob], marks: LandmarkFiles, *, strict: bool, outer: bool, quiet: bool, say: Say
 ) -> ScansRead:
     """Read and repair every scan; those that cannot be used are in `unread`, with the reason."""
     read = ScansRead()
@@ -369,7 +370,7 @@ def report_landmarks(records: Sequence[CorrespondRecord], read: ScansRead, say: 
     say(f"{sentence}{after}.")
 
 
-def _make_record(job: Job, scan: Corresponding, read: ScansRead, folder: Path, mean_size: float) -> CorrespondRecord:
+def _make_record(job: FitJob, scan: Corresponding, read: ScansRead, folder: Path, mean_size: float) -> CorrespondRecord:
     """Return the record of a scan; `mean_size` is the RMS size of the mean shape."""
     source = job.source(folder)
     record = CorrespondRecord(

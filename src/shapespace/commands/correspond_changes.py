@@ -14,7 +14,7 @@ import numpy as np
 from msgspec import structs
 
 from shapespace.batch.executors import ExecutionConfig
-from shapespace.batch.fit_work import Job
+from shapespace.batch.fit_work import FitJob
 from shapespace.commands.correspond import (
     CHANGE_FOLDER,
     CorrespondenceFolder,
@@ -157,13 +157,13 @@ class _FinishedFolder:
                 known = first_names(list(self.records), _LISTED)
                 raise InputError(f"{option} {name}: {self.results.path} has no scan of that name; it has {known}.")
 
-    def job(self, name: str) -> Job:
+    def job(self, name: str) -> FitJob:
         """Return the job of a scan, from where it was."""
         record = self.records[name]
         known = {key: str(value) for key, value in record.metadata.items() if value is not None}
         if is_address(record.path):
-            return Job(name, Given(record.path).path, metadata=known, address=record.path)
-        return Job(name, Path(os.path.normpath(self.results.path / record.path)), metadata=known)
+            return FitJob(name, Given(record.path).path, metadata=known, address=record.path)
+        return FitJob(name, Path(os.path.normpath(self.results.path / record.path)), metadata=known)
 
 
 def change_correspondence(
@@ -235,7 +235,7 @@ def change_correspondence(
 # Which scans
 
 
-def _new_jobs(finished: _FinishedFolder, change: Change, given: Sequence[Job]) -> list[Job]:
+def _new_jobs(finished: _FinishedFolder, change: Change, given: Sequence[FitJob]) -> list[FitJob]:
     """Return the scans that are registered to the mean: new ones, or those that are registered again."""
     if change.add:
         return _jobs_to_add(finished, given)
@@ -248,7 +248,7 @@ def _new_jobs(finished: _FinishedFolder, change: Change, given: Sequence[Job]) -
     return [by_name.get(name) or finished.job(name) for name in dict.fromkeys(change.redo)]
 
 
-def _jobs_to_add(finished: _FinishedFolder, given: Sequence[Job]) -> list[Job]:
+def _jobs_to_add(finished: _FinishedFolder, given: Sequence[FitJob]) -> list[FitJob]:
     """Return the `given` scans that the correspondence does not have yet; it has no others of the same names."""
     if not given:
         raise InputError("--add needs scans; give their files or folders.")
@@ -262,7 +262,7 @@ def _jobs_to_add(finished: _FinishedFolder, given: Sequence[Job]) -> list[Job]:
     return [job for job in given if job.name not in finished.records]
 
 
-def _old_jobs(finished: _FinishedFolder, change: Change, given: Sequence[Job]) -> list[Job]:
+def _old_jobs(finished: _FinishedFolder, change: Change, given: Sequence[FitJob]) -> list[FitJob]:
     """Return the scans of the correspondence that stay in it, from the `given` scans or from where they were."""
     moved = {} if change.add else {job.name: job for job in given}
     names = [name for name in finished.records if name not in (*change.redo, *change.remove)]

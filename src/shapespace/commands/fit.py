@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from shapespace.batch.executors import ExecutionConfig, Serial
 from shapespace.batch.fit_records import source_of
-from shapespace.batch.fit_work import Job
+from shapespace.batch.fit_work import FitJob
 from shapespace.batch.progress import progress, telling_of_compiling
 from shapespace.batch.result_folder import RECORD
 from shapespace.batch.run import STORE_FROM, BatchConfig, FolderSink, Plan, StoreSink, fit_many, make_jobs
@@ -33,7 +33,7 @@ from shapespace.io.remote import is_address
 from shapespace.io.tables.table_io import table_rows, table_text
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import first_names
-from shapespace.schemas import FitRecord, OverlapDistances
+from shapespace.schemas import FitRecord, OverlapRecord
 from shapespace.store.manifest import read_manifest
 
 FULL_CHECK_BYTES = 2**28
@@ -157,7 +157,7 @@ def _fit_lines(named: tuple[str, FitRecord]) -> list[str]:
     ]
 
 
-def _distances(overlap: OverlapDistances | None, measure: str = "mean") -> str:
+def _distances(overlap: OverlapRecord | None, measure: str = "mean") -> str:
     """Return the overlap distances as text; empty if the record has none."""
     if overlap is None:
         return ""
@@ -183,7 +183,7 @@ def _arrow() -> str:
     return "\N{RIGHTWARDS ARROW}"
 
 
-def _write_list(folder: Path, jobs: Sequence[Job]) -> None:
+def _write_list(folder: Path, jobs: Sequence[FitJob]) -> None:
     """Write the list of the scans whose results are in a folder, by which `fit` takes them again.
 
     It has the scans of this run, and those of the earlier list whose results are still there. One scan without
@@ -234,7 +234,7 @@ class _Watch:
         for sentence in plan.sentences():
             self.say(sentence)
 
-    def done(self, job: Job, record: FitRecord) -> None:
+    def done(self, job: FitJob, record: FitRecord) -> None:
         self.bar.update()
         if any(NON_FINITE in note for note in record.notes):
             self.removed.append(job.name)
@@ -247,7 +247,7 @@ class _Watch:
         self.say(record.reason if failed else f"{job.label}: {record.status}: {record.reason}")
 
 
-def find_suspects(jobs: Sequence[Job], *, quiet: bool) -> set[str]:
+def find_suspects(jobs: Sequence[FitJob], *, quiet: bool) -> set[str]:
     """Return the names of jobs whose scans probably cannot be read, so that they are done, and reported, first.
 
     Scans of up to `FULL_CHECK_BYTES` together are read completely; of larger sets, each scan is checked by its first
@@ -286,7 +286,7 @@ def landmark_files(landmarks: Path | None, scans: int) -> tuple[Path | None, Lan
     return landmarks, LandmarkFiles.of(None)
 
 
-def scan_jobs(given: Sequence[Given], landmarks: Path | None, many: LandmarkFiles, folder: Path) -> list[Job]:
+def scan_jobs(given: Sequence[Given], landmarks: Path | None, many: LandmarkFiles, folder: Path) -> list[FitJob]:
     """Return a job for each scan; one that lies elsewhere is named by its address as by a path.
 
     Args:

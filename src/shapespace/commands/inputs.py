@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from shapespace.batch.fit_work import Job, naming
+from shapespace.batch.fit_work import FitJob, naming
 from shapespace.batch.progress import progress
 from shapespace.batch.result_folder import RECORD
 from shapespace.cohort.table import fold_name, refuse_repeated
@@ -97,7 +97,7 @@ def given_scans(
     return rows
 
 
-def with_ids(jobs: Sequence[Job], given: Sequence[Given]) -> list[Job]:
+def with_ids(jobs: Sequence[FitJob], given: Sequence[Given]) -> list[FitJob]:
     """Return `jobs` named by the ids of their scans, if these have ids, with the metadata of the scans.
 
     Raises:
@@ -107,7 +107,7 @@ def with_ids(jobs: Sequence[Job], given: Sequence[Given]) -> list[Job]:
         replace(job, name=scan.called or job.name, metadata=scan.metadata)
         for job, scan in zip(jobs, given, strict=True)
     ]
-    seen: dict[str, Job] = {}
+    seen: dict[str, FitJob] = {}
     for job in named:
         if seen.setdefault(job.name.casefold(), job).label != job.label:
             raise InputError(f"{seen[job.name.casefold()].label} and {job.label} would both be {job.name}; give ids.")

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from shapespace.batch.fit_work import Job
+from shapespace.batch.fit_work import FitJob
 from shapespace.batch.progress import progress
 from shapespace.commands.inputs import Given, LandmarkFiles
 from shapespace.commands.outcome import LISTED, Outcome, first_lines
@@ -259,7 +259,7 @@ def _read_scan(same: _Correspondence, surface: Mesh, say: Say) -> Mesh | None:
     try:
         path = read(CorrespondRecord, json_of(file), file.name, CORRESPOND_AGAIN).path
         at = Given(path).path if is_address(path) else Path(os.path.normpath(same.folder / path))
-        with Job(surface.name, at, address=path if is_address(path) else "").readable() as copy:
+        with FitJob(surface.name, at, address=path if is_address(path) else "").readable() as copy:
             return read_mesh(copy)
     except ShapespaceError as error:
         say(f"{surface.name}: landmarks are on the corresponding surface, since the scan cannot be read: {error}")

@@ -19,7 +19,15 @@ from shapespace.geometry.procrustes import Gauge
 from shapespace.io.files import make_folder, write_text
 from shapespace.io.meshes.mesh_io import mesh_files, read_mesh
 from shapespace.model.foreign import looks_like_model
-from shapespace.model.model_quality import Curve, ModelQuality, Part, QualityConfig, Runner, Shapes, measure_quality
+from shapespace.model.model_quality import (
+    Curve,
+    ModelQuality,
+    QualityConfig,
+    QualityTask,
+    Runner,
+    Shapes,
+    measure_quality,
+)
 from shapespace.model.representation import representation_named
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import BySize, Measured, Quality, json_text, to_json
@@ -72,7 +80,7 @@ class QualityOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class _Target:
+class _QualityInput:
     """A model or meshes in correspondence, with a name that distinguishes it from the other target."""
 
     name: str
@@ -155,7 +163,7 @@ def quality_lines(quality: Quality) -> list[str]:
 
 def _load_targets(
     paths: Sequence[Path], config: QualityConfig, options: QualityOptions, notes: list[str], *, quiet: bool
-) -> list[_Target]:
+) -> list[_QualityInput]:
     names = list(options.representations)
     if len(paths) > _MOST_TARGETS or len(names) > _MOST_TARGETS:
         raise InputError("At most two targets or representations are compared; give one or two.")
@@ -170,10 +178,10 @@ def _load_targets(
     if len(paths) == 1 and len(names) == _MOST_TARGETS:
         pairs = [(0, name) for name in names]
     several = len({name for _, name in pairs}) > 1
-    out: list[_Target] = []
+    out: list[_QualityInput] = []
     for k, name in pairs:
         called = f"{paths[k]}, {name}" if several else str(paths[k])
-        out.append(_Target(called, loaded[k][0], _config_of_representation(config, name, names), loaded[k][1]))
+        out.append(_QualityInput(called, loaded[k][0], _config_of_representation(config, name, names), loaded[k][1]))
     if len(out) == _MOST_TARGETS and not any(isinstance(target.data, ShapeModel) for target in out):
         _check_same_shapes(out)
     return out
@@ -185,7 +193,7 @@ def _config_of_representation(config: QualityConfig, name: str, names: Sequence[
     return replace(config, representation=name, control_points=config.control_points if splines else None)
 
 
-def _check_same_shapes(targets: Sequence[_Target]) -> None:
+def _check_same_shapes(targets: Sequence[_QualityInput]) -> None:
     first, second = (target.names for target in targets)
     if len(first) != len(second) or (first != second and set(first) & set(second)):
         lacking = sorted(set(first) ^ set(second))
@@ -219,7 +227,7 @@ def _read_meshes(
     return meshes, {surface_stem(file): ratio for file, ratio in listed.unit_ratios.items()}
 
 
-def _read_scans(target: _Target, folder: Path | None, *, quiet: bool) -> list[Mesh] | None:
+def _read_scans(target: _QualityInput, folder: Path | None, *, quiet: bool) -> list[Mesh] | None:
     """Return the scans of the meshes of a target, in their order; None if no scans are given or needed."""
     if folder is None or isinstance(target.data, ShapeModel):
         return None
@@ -240,14 +248,14 @@ def _read_scans(target: _Target, folder: Path | None, *, quiet: bool) -> list[Me
     return out
 
 
-def _measure(target: _Target, options: QualityOptions, run: Runner, *, quiet: bool) -> ModelQuality:
+def _measure(target: _QualityInput, options: QualityOptions, run: Runner, *, quiet: bool) -> ModelQuality:
     unseen = [] if options.unseen is None else _read_meshes(options.unseen, [], "shape", options, quiet=quiet)[0]
     scans = _read_scans(target, options.scans, quiet=quiet)
     with steps(None, f"measuring {target.name}, in", "step", quiet=quiet) as step:
         return measure_quality(target.data, target.config, scans=scans, unseen=unseen, progress=step, run=run)
 
 
-def _missing_sentence(target: _Target, result: ModelQuality) -> str:
+def _missing_sentence(target: _QualityInput, result: ModelQuality) -> str:
     text = (
         f"{target.name}: {100 * result.missing_share:.1f} % of the vertices are missing, and nothing is measured there"
     )
@@ -262,7 +270,7 @@ def _measured_curve(curve: Curve) -> Measured:
     return Measured(mean=tuple(curve.mean.tolist()), modes=tuple(curve.counts.tolist()), low=low, high=high)
 
 
-def _as_quality(target: _Target, result: ModelQuality, options: QualityOptions) -> Quality:
+def _as_quality(target: _QualityInput, result: ModelQuality, options: QualityOptions) -> Quality:
     curves: dict[str, Curve | None] = {name: getattr(result, name) for name in _UNITS}
     size, by_shapes = result.by_shapes, None
     if size is not None:
@@ -288,7 +296,7 @@ def _as_quality(target: _Target, result: ModelQuality, options: QualityOptions) 
     return structs.replace(quality, **measured)
 
 
-def _comparison_sentences(targets: Sequence[_Target], differences: dict[str, Curve]) -> list[str]:
+def _comparison_sentences(targets: Sequence[_QualityInput], differences: dict[str, Curve]) -> list[str]:
     """Return in a sentence which of two generalises better, with all modes."""
     curve = differences.get("generalisation", differences.get("reconstruction"))
     if curve is None:
@@ -326,7 +334,7 @@ class QualityRunner:
     folder: Path
     quiet: bool
 
-    def __call__(self, shapes: Shapes, parts: Sequence[Part]) -> Iterator[tuple[Part, FloatArray]]:
+    def __call__(self, shapes: Shapes, parts: Sequence[QualityTask]) -> Iterator[tuple[QualityTask, FloatArray]]:
         """Yield each of `parts` with its errors, in any order.
 
         Raises:
@@ -356,7 +364,7 @@ class QualityWork:
 
     shapes: Shared[Shapes]
 
-    def do(self, part: Part) -> tuple[FloatArray | None, str]:
+    def do(self, part: QualityTask) -> tuple[FloatArray | None, str]:
         """Return the errors of one part.
 
         Raises:
@@ -364,6 +372,6 @@ class QualityWork:
         """
         return self.shapes.value().do(part), ""
 
-    def give_up(self, _part: Part, reason: str) -> tuple[FloatArray | None, str]:
+    def give_up(self, _part: QualityTask, reason: str) -> tuple[FloatArray | None, str]:
         """Return no errors and the reason."""
         return None, reason

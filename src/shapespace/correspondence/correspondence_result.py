@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from shapespace.correspondence.scan_status import ScanEvidence, ScanStatus, SurfaceMeasures, find_review_reasons
+from shapespace.correspondence.scan_status import ScanStatus, SurfaceEvidence, SurfaceMeasures, find_review_reasons
 from shapespace.errors import InputError
 from shapespace.geometry.mirror_plane import FLIP
 from shapespace.geometry.normals import rms_size
@@ -82,7 +82,7 @@ class Corresponding:
     status: ScanStatus = "excluded"
     probability: float = np.nan
     doubt: str = ""
-    evidence: ScanEvidence | None = None
+    evidence: SurfaceEvidence | None = None
     position_std: FloatArray | None = None
     measures: SurfaceMeasures | None = None
     review: tuple[ReviewReason, ...] = ()

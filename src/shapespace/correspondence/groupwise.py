@@ -41,7 +41,7 @@ from shapespace.correspondence.registration import (
 from shapespace.correspondence.scan_status import (
     MOST_FOLDED,
     Judgement,
-    ScanEvidence,
+    SurfaceEvidence,
     SurfaceMeasures,
     judge,
 )
@@ -50,7 +50,7 @@ from shapespace.correspondence.template import PoseModel, clean_scan
 from shapespace.correspondence.vertex_confidence import VertexConfidence
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.geometry.landmark_placement import place_landmarks
-from shapespace.geometry.mirror_plane import ASYMMETRIC, FLIP, Sides, mirror_image, solve_sides
+from shapespace.geometry.mirror_plane import ASYMMETRIC, FLIP, ScanSides, mirror_image, solve_sides
 from shapespace.geometry.normals import Distortion, face_areas, rms_size, without_estimates
 from shapespace.geometry.procrustes import align_to_weighted_mean
 from shapespace.geometry.similarity import fit_similarity
@@ -118,7 +118,7 @@ def correspond(
     first = first or first_template(scans, template, config, model)
     if subjects and len(subjects) != len(scans):
         raise InputError(f"There are {len(subjects)} subjects for {len(scans)} scans; give one for each scan.")
-    problem = replace(_Problem.of([scan.name for scan in scans], first, config), subjects=tuple(subjects))
+    problem = replace(_RunConstants.of([scan.name for scan in scans], first, config), subjects=tuple(subjects))
     problem, sides = _decide_sides(problem, run, may_reflect=template is None and model is None)
     state = _initial_state(problem, sides)
     for _ in range(config.rounds):
@@ -155,7 +155,7 @@ def _check_folds(result: Correspondence, config: CorrespondConfig) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
+class _RunConstants:
     """Constants of all rounds.
 
     Args:
@@ -177,8 +177,8 @@ class _Problem:
     subjects: tuple[str, ...] = ()
 
     @staticmethod
-    def of(names: Sequence[str], first: FirstTemplate, config: CorrespondConfig) -> _Problem:
-        return _Problem(names, first, config, Harmonics.of(first.mesh, config.first.harmonics))
+    def of(names: Sequence[str], first: FirstTemplate, config: CorrespondConfig) -> _RunConstants:
+        return _RunConstants(names, first, config, Harmonics.of(first.mesh, config.first.harmonics))
 
     def scan(self, i: int, *, mirrored: bool) -> Mesh:
         """Return scan `i`, or its mirror image."""
@@ -229,7 +229,7 @@ class RegistrationState:
     registrations: Mapping[int, ScanRegistration]
     excluded: Mapping[int, str]
     predictions: Mapping[int, FloatArray]
-    sides: Sides
+    sides: ScanSides
     rounds: tuple[RoundRecord, ...]
     other_kinds: Mapping[int, int] = field(default_factory=dict[int, int])
     consensus: Mapping[int, Similarity] = field(default_factory=dict[int, Similarity])
@@ -260,7 +260,7 @@ class RegistrationState:
         return shapes, np.stack([self.registrations[i].observed for i in order]).astype(np.float64)
 
 
-def _initial_state(problem: _Problem, sides: Sides) -> RegistrationState:
+def _initial_state(problem: _RunConstants, sides: ScanSides) -> RegistrationState:
     mesh, broken = problem.first.mesh, dict(problem.first.broken)
     return RegistrationState(mesh, place_landmarks(mesh, mesh.landmarks), {}, broken, {}, sides, ())
 
@@ -268,7 +268,7 @@ def _initial_state(problem: _Problem, sides: Sides) -> RegistrationState:
 # Sides
 
 
-def _decide_sides(problem: _Problem, run: Runner, *, may_reflect: bool) -> tuple[_Problem, Sides]:
+def _decide_sides(problem: _RunConstants, run: Runner, *, may_reflect: bool) -> tuple[_RunConstants, ScanSides]:
     """Return the sides of all scans, and the problem with their comparisons and its template on the majority's side.
 
     Args:
@@ -277,7 +277,7 @@ def _decide_sides(problem: _Problem, run: Runner, *, may_reflect: bool) -> tuple
         may_reflect: whether the template may be reflected; otherwise its side is that of the majority.
     """
     count = len(problem.names)
-    sides = Sides(np.zeros(count, np.bool_), np.zeros(count), decided=False)
+    sides = ScanSides(np.zeros(count, np.bool_), np.zeros(count), decided=False)
     is_enough = len(problem.first.repaired) >= ENOUGH_TO_JUDGE
     if problem.config.mirror == "never" and (problem.config.pose != "search" or not is_enough):  # nothing is compared
         return problem, sides
@@ -305,8 +305,8 @@ def _decide_sides(problem: _Problem, run: Runner, *, may_reflect: bool) -> tuple
 
 
 def _compare_with_anchor(
-    problem: _Problem, context: RoundContext, anchor: int, run: Runner
-) -> tuple[_Problem, FloatArray]:
+    problem: _RunConstants, context: RoundContext, anchor: int, run: Runner
+) -> tuple[_RunConstants, FloatArray]:
     """Return the problem with the comparisons of all scans with an anchor, and the scores (N, 2) of both sides."""
     sides: Comparison = "pose" if problem.config.mirror == "never" else "scores"
     tasks = [
@@ -324,7 +324,7 @@ def _compare_with_anchor(
     return replace(problem, comparisons=tuple(comparisons)), scores
 
 
-def _find_anchors(problem: _Problem) -> Iterator[tuple[int, PoseModel]]:
+def _find_anchors(problem: _RunConstants) -> Iterator[tuple[int, PoseModel]]:
     """Yield the number and the pose model of some scans that can be templates."""
     for i in np.random.default_rng(problem.config.seed).permutation(list(problem.first.repaired)).tolist():
         try:
@@ -336,7 +336,7 @@ def _find_anchors(problem: _Problem) -> Iterator[tuple[int, PoseModel]]:
 # One round
 
 
-def _round_context(problem: _Problem, state: RegistrationState) -> RoundContext:
+def _round_context(problem: _RunConstants, state: RegistrationState) -> RoundContext:
     """Return the shared input of the tasks of the next round."""
     order, seed = sorted(state.registrations), problem.config.seed
     if len(order) < ENOUGH_TO_JUDGE:
@@ -353,7 +353,7 @@ def _part_of_scan(i: int) -> int:
     return i % _PARTS
 
 
-def _make_task(problem: _Problem, state: RegistrationState, i: int) -> RegistrationTask:
+def _make_task(problem: _RunConstants, state: RegistrationState, i: int) -> RegistrationTask:
     """Return the task of scan `i` in the next round; an excluded scan is searched for in all poses."""
     known, config = i in state.registrations, problem.config
     mirrored = state.is_mirrored(i)
@@ -384,7 +384,7 @@ def _other_pose(state: RegistrationState, i: int) -> Similarity | None:
     return T if angle_deg(T, state.registrations[i].T_scan_template) > SAME_POSE_DEG else None
 
 
-def _choose_comparison(problem: _Problem, state: RegistrationState, i: int) -> Comparison:
+def _choose_comparison(problem: _RunConstants, state: RegistrationState, i: int) -> Comparison:
     """Return the comparison of scan `i` with its mirror image in the next round."""
     if problem.config.mirror == "never":
         return "as given"
@@ -420,7 +420,7 @@ def _pose_with_usual_size(state: RegistrationState, i: int) -> Similarity:
 
 
 def _next_state(
-    problem: _Problem, previous: RegistrationState, registrations: Iterable[ScanRegistration]
+    problem: _RunConstants, previous: RegistrationState, registrations: Iterable[ScanRegistration]
 ) -> RegistrationState:
     """Return the state after a round.
 
@@ -445,7 +445,7 @@ def _next_state(
 
 
 def _decide_sides_by_strain(
-    problem: _Problem, previous: RegistrationState, state: RegistrationState, run: Runner
+    problem: _RunConstants, previous: RegistrationState, state: RegistrationState, run: Runner
 ) -> RegistrationState:
     """Return the state of the first round with the sides of an object that bends.
 
@@ -474,7 +474,7 @@ def _decide_sides_by_strain(
 
 
 def _register_by_subject(
-    problem: _Problem, previous: RegistrationState, state: RegistrationState, run: Runner
+    problem: _RunConstants, previous: RegistrationState, state: RegistrationState, run: Runner
 ) -> RegistrationState:
     """Return the state of the first round with each scan registered from the surface of another scan of its subject."""
     order = sorted(state.registrations)
@@ -502,7 +502,9 @@ def _register_by_subject(
 # Selection of the registrations
 
 
-def _accept(problem: _Problem, previous: RegistrationState, ended: Sequence[ScanRegistration]) -> RegistrationState:
+def _accept(
+    problem: _RunConstants, previous: RegistrationState, ended: Sequence[ScanRegistration]
+) -> RegistrationState:
     """Return the state with the registrations of a round that are valid, and reasons for the others."""
     registrations: dict[int, ScanRegistration] = {}
     excluded = dict(problem.first.broken)
@@ -536,7 +538,7 @@ def _wrong_names(registration: ScanRegistration) -> str:
     return "; or its landmarks, which determine its pose, have wrong names" if registration.posed_by_landmarks else ""
 
 
-def _exclude_other_kinds(problem: _Problem, state: RegistrationState, order: Sequence[int]) -> RegistrationState:
+def _exclude_other_kinds(problem: _RunConstants, state: RegistrationState, order: Sequence[int]) -> RegistrationState:
     """Exclude the scans in `order` that are another kind of object than the largest group, or resemble no other."""
     if problem.subjects:  # scans of one subject predict each other, and are not a kind of object
         order = list({problem.subjects[i]: i for i in sorted(order, reverse=True)}.values())
@@ -572,7 +574,7 @@ def _outlier_reason(registration: ScanRegistration, distance: float) -> str:
     )
 
 
-def _resolve_alternatives(problem: _Problem, state: RegistrationState) -> RegistrationState:
+def _resolve_alternatives(problem: _RunConstants, state: RegistrationState) -> RegistrationState:
     """If several poses are about equally likely, use the one whose shape the scans of certain pose predict best."""
     sure = [i for i, registration in state.registrations.items() if not registration.alternatives]
     if not _ENOUGH_TO_PREDICT <= len(sure) < len(state.registrations):
@@ -597,7 +599,7 @@ def _resolve_alternatives(problem: _Problem, state: RegistrationState) -> Regist
     return replace(state, registrations={i: best(registration) for i, registration in state.registrations.items()})
 
 
-def _exclude_mirrored(problem: _Problem, state: RegistrationState) -> RegistrationState:
+def _exclude_mirrored(problem: _RunConstants, state: RegistrationState) -> RegistrationState:
     """Exclude mirrored scans if the setting `mirror` is `ask`."""
     if problem.config.mirror != "ask":
         return state
@@ -610,13 +612,13 @@ def _exclude_mirrored(problem: _Problem, state: RegistrationState) -> Registrati
 # Evidence
 
 
-def _find_evidence(state: RegistrationState) -> dict[int, ScanEvidence]:
+def _find_evidence(state: RegistrationState) -> dict[int, SurfaceEvidence]:
     """Return the evidence on each registered scan; none if there are too few scans to determine the usual values."""
     if not state.relief_agreement:
         return {}
     usual = float(np.median(list(state.relief_agreement.values())))
     return {
-        i: ScanEvidence(
+        i: SurfaceEvidence(
             relief_agreement=own, usual_relief_agreement=usual, consensus_deg=_consensus_deg(state, i),
             relief_gap=state.registrations[i].relief_gap,
         )
@@ -634,7 +636,7 @@ def _consensus_deg(state: RegistrationState, i: int) -> float:
 
 
 def _update_template(
-    problem: _Problem, previous: RegistrationState, state: RegistrationState, cpu_s: Mapping[int, float]
+    problem: _RunConstants, previous: RegistrationState, state: RegistrationState, cpu_s: Mapping[int, float]
 ) -> RegistrationState:
     """Make the mean of the round the template, and predict each scan from the others."""
     order = sorted(state.registrations)
@@ -697,7 +699,7 @@ def _median_colours(registrations: Mapping[int, ScanRegistration]) -> ByteArray 
     return np.nanmedian(colours, axis=0).astype(np.uint8)
 
 
-def _find_consensus(problem: _Problem, state: RegistrationState) -> dict[int, Similarity]:
+def _find_consensus(problem: _RunConstants, state: RegistrationState) -> dict[int, Similarity]:
     """Return the poses on which the comparisons agree (C32); none for few scans, or if frames of files are used."""
     if problem.config.pose != "search" or len(problem.first.repaired) < ENOUGH_TO_JUDGE:
         return {}
@@ -719,7 +721,9 @@ def _squared_movement(previous: RegistrationState, i: int, shape: FloatArray) ->
     return float(((fit_similarity(before, shape).apply(before) - shape) ** 2).sum(axis=1).mean())
 
 
-def _landmarks_on(template: Mesh, problem: _Problem, registrations: Mapping[int, ScanRegistration]) -> SurfaceLandmarks:
+def _landmarks_on(
+    template: Mesh, problem: _RunConstants, registrations: Mapping[int, ScanRegistration]
+) -> SurfaceLandmarks:
     """Return the positions of the landmarks of the registered scans on the template."""
 
     def in_template_frame(i: int) -> dict[str, FloatArray]:
@@ -792,7 +796,7 @@ def add_scans(
     names = [mesh.name for mesh in (*finished.surfaces, *scans)]
     origin = "The template is the mean of the finished correspondence."
     first = FirstTemplate(finished.mean, origin, repaired, broken, notes)
-    problem = _Problem.of(names, first, config)
+    problem = _RunConstants.of(names, first, config)
     start = _finished_state(problem, finished)
     states = _added_states(problem, start, [i for i in repaired if i >= kept], run)
     judged = {i: _judge_by_finished(problem, state, i) for i, state in states.items()}
@@ -810,7 +814,11 @@ def add_scans(
 
 
 def _added_result(
-    problem: _Problem, state: RegistrationState, evidence: ScanEvidence | None, i: int, confidence: VertexConfidence
+    problem: _RunConstants,
+    state: RegistrationState,
+    evidence: SurfaceEvidence | None,
+    i: int,
+    confidence: VertexConfidence,
 ) -> Corresponding:
     own = state.registrations.get(i)
     if own is None or own.observed.all():  # estimates take long where there are many scans
@@ -818,7 +826,7 @@ def _added_result(
     return _scan_result(problem, state, i, _complete_shapes(problem, state)[i], evidence, confidence)
 
 
-def _finished_state(problem: _Problem, finished: FinishedCorrespondence) -> RegistrationState:
+def _finished_state(problem: _RunConstants, finished: FinishedCorrespondence) -> RegistrationState:
     """Return the state after the last round of a finished correspondence, from its surfaces aligned to its mean."""
     registrations: dict[int, ScanRegistration] = {}
     for i, surface in enumerate(finished.surfaces):
@@ -840,12 +848,12 @@ def _finished_state(problem: _Problem, finished: FinishedCorrespondence) -> Regi
         ],
     )
     unknown = np.zeros(len(problem.names))
-    sides = Sides(unknown > 0, unknown, finished.sides_decided)
+    sides = ScanSides(unknown > 0, unknown, finished.sides_decided)
     return RegistrationState(finished.mean, places, registrations, dict(problem.first.broken), {}, sides, ())
 
 
 def _added_states(
-    problem: _Problem, start: RegistrationState, added: Sequence[int], run: Runner
+    problem: _RunConstants, start: RegistrationState, added: Sequence[int], run: Runner
 ) -> dict[int, RegistrationState]:
     """Return for each scan of `added` the state of the finished scans and this scan, after its last round."""
     shapes = start.shapes(sorted(start.registrations))[0]
@@ -867,7 +875,7 @@ def _added_states(
 
 
 def _next_added_state(
-    problem: _Problem,
+    problem: _RunConstants,
     start: RegistrationState,
     previous: RegistrationState,
     registration: ScanRegistration,
@@ -896,8 +904,8 @@ def _next_added_state(
 
 
 def _judge_by_finished(
-    problem: _Problem, state: RegistrationState, i: int
-) -> tuple[RegistrationState, ScanEvidence | None]:
+    problem: _RunConstants, state: RegistrationState, i: int
+) -> tuple[RegistrationState, SurfaceEvidence | None]:
     """Return the state of an added scan, which excludes an outlier among the finished scans, and their evidence.
 
     There is no evidence if there are too few finished scans.
@@ -914,7 +922,7 @@ def _judge_by_finished(
         excluded = {i: _outlier_reason(state.registrations[i], float(distance))}
         registrations = {j: registration for j, registration in state.registrations.items() if j != i}
         return replace(state, registrations=registrations, excluded=excluded), None
-    return state, ScanEvidence(relief_agreement=own, usual_relief_agreement=float(np.median(others)))
+    return state, SurfaceEvidence(relief_agreement=own, usual_relief_agreement=float(np.median(others)))
 
 
 def _merge_states(start: RegistrationState, states: Mapping[int, RegistrationState]) -> RegistrationState:
@@ -938,7 +946,7 @@ def _group_kinds(state: RegistrationState) -> list[list[int]]:
 
 
 def _make_result(
-    problem: _Problem, state: RegistrationState, evidence: Mapping[int, ScanEvidence], given: str | None = None
+    problem: _RunConstants, state: RegistrationState, evidence: Mapping[int, SurfaceEvidence], given: str | None = None
 ) -> Correspondence:
     """Return the result of all scans; `given` is the template or model of the first round, None for later rounds."""
     complete, groups = _complete_shapes(problem, state), _group_kinds(state)
@@ -972,7 +980,7 @@ def _note_other_shape(scan: Corresponding) -> Corresponding:
     )
 
 
-def _complete_shapes(problem: _Problem, state: RegistrationState) -> dict[int, FloatArray]:
+def _complete_shapes(problem: _RunConstants, state: RegistrationState) -> dict[int, FloatArray]:
     """Return the vertices (V, 3) of each registered scan, in the template's frame, with estimates where not observed.
 
     An estimate is the conditional mean by probabilistic PCA of all registered scans (C27). A vertex that fewer than
@@ -989,11 +997,11 @@ def _complete_shapes(problem: _Problem, state: RegistrationState) -> dict[int, F
 
 
 def _scan_result(
-    problem: _Problem,
+    problem: _RunConstants,
     state: RegistrationState,
     i: int,
     complete: FloatArray | None,
-    evidence: ScanEvidence | None,
+    evidence: SurfaceEvidence | None,
     confidence: VertexConfidence,
 ) -> Corresponding:
     """Return the result of scan `i`; `complete` are its vertices (V, 3) in the template's frame, None if excluded."""

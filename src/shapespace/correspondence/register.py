@@ -106,7 +106,7 @@ class ElasticState:
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
+class _RegistrationConstants:
     """Constants of all iterations.
 
     Args:
@@ -167,14 +167,16 @@ def register(
     """
     base = np.array(template.mesh.vertices if expected is None else expected)
     colours = _colour_lengths(template, target, settings)
-    problem = _Problem(template, target, base, landmarks, settings, colours)
+    problem = _RegistrationConstants(template, target, base, landmarks, settings, colours)
     state, rng = ElasticState(base, T_scan_template), np.random.default_rng(seed)
     for range_share in np.geomspace(settings.widest, settings.narrowest, settings.iterations):
         state = _step(problem, state, float(range_share), rng)
     return state
 
 
-def _step(problem: _Problem, state: ElasticState, range_share: float, rng: np.random.Generator) -> ElasticState:
+def _step(
+    problem: _RegistrationConstants, state: ElasticState, range_share: float, rng: np.random.Generator
+) -> ElasticState:
     """Return the state after one iteration over a range of the surface, a share of its size; `rng` draws the points."""
     template, settings = problem.template, problem.settings
     harmonics, size_mm = template.harmonics, template.size_mm
@@ -204,7 +206,7 @@ def _colour_lengths(template: Template, target: ScanTarget, settings: ElasticSet
 
 
 def _sample_points(
-    problem: _Problem, state: ElasticState, coarse: bool, rng: np.random.Generator
+    problem: _RegistrationConstants, state: ElasticState, coarse: bool, rng: np.random.Generator
 ) -> tuple[IntArray, _Samples, _Samples]:
     """Return the vertices (M,) of the template that are matched, with their points, and points of the scan."""
     topology, target, settings = problem.template.topology, problem.target, problem.settings

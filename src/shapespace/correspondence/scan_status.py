@@ -41,7 +41,7 @@ eight femora and of eight molars has none, with 1000 and 3000 vertices."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScanEvidence:
+class SurfaceEvidence:
     """Comparison of one surface with the shapes of the other scans.
 
     Args:
@@ -78,7 +78,7 @@ class Judgement:
     doubt: str
 
 
-def judge(evidence: ScanEvidence) -> Judgement:
+def judge(evidence: SurfaceEvidence) -> Judgement:
     """Return the status of a scan (C33)."""
     consensus, relief = evidence.features()
     is_ambiguous = evidence.relief_gap < _GAP

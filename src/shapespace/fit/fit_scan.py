@@ -36,7 +36,7 @@ from shapespace.geometry.landmark_placement import landmarks_in_frame_of
 from shapespace.geometry.normals import rms_size
 from shapespace.io.interop import MeshLike, as_mesh
 from shapespace.io.landmarks.landmark_io import read_landmarks
-from shapespace.model.region import Part
+from shapespace.model.region import ModelRegion
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, BoolArray, FloatArray, IntArray, Mesh, Similarity, SurfaceLandmarks
 from shapespace.version import __version__
@@ -55,7 +55,7 @@ class RegionFit:
     """
 
     full: ShapeModel
-    part: Part
+    part: ModelRegion
 
     @staticmethod
     def of(full: ShapeModel, region: str | tuple[int, ...]) -> RegionFit:
@@ -64,7 +64,7 @@ class RegionFit:
         Raises:
             InputError: there is no such region, or no triangle lies in it.
         """
-        return RegionFit(full, Part.of(full, region))
+        return RegionFit(full, ModelRegion.of(full, region))
 
     def note(self, region: str | tuple[int, ...] | None) -> str:
         """Return a sentence on the region that the fit is restricted to."""

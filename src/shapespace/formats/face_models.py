@@ -22,8 +22,8 @@ from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import open_file
 from shapespace.io.sandbox import (
     HDF5_SIGNATURE,
+    FileContent,
     SandboxError,
-    Tree,
     read_hdf5_sandboxed,
     read_matlab_sandboxed,
     read_pickle_sandboxed,
@@ -194,7 +194,7 @@ def read_matlab(path: Path) -> LinearModel:
         raise ModelFileError(f"{path} is damaged or cut short: {error}; {_AGAIN}.") from error
 
 
-def _matlab_tree(path: Path) -> Tree:
+def _matlab_tree(path: Path) -> FileContent:
     with open_file(path) as stream:
         head = stream.read(_HDF5_AT + len(HDF5_SIGNATURE))
     if not (head.startswith(HDF5_SIGNATURE) or head[_HDF5_AT:] == HDF5_SIGNATURE):
@@ -203,10 +203,10 @@ def _matlab_tree(path: Path) -> Tree:
         path, leave=("/texMU", "/texPC", "/tex", "/segbin", "/segbb", "/segMM", "/segMB", "/#refs#")
     )
     # MATLAB stores arrays with the last axis first.
-    return Tree({name: array.T for name, array in tree.arrays.items()}, groups=tree.groups)
+    return FileContent({name: array.T for name, array in tree.arrays.items()}, groups=tree.groups)
 
 
-def _matlab_model(tree: Tree, layout: _Layout) -> LinearModel:
+def _matlab_model(tree: FileContent, layout: _Layout) -> LinearModel:
     mean, basis, spread = (
         np.asarray(tree.arrays[name], dtype=np.float64) for name in (layout.mean, layout.basis, layout.spread)
     )

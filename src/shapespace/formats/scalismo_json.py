@@ -18,7 +18,7 @@ from shapespace.formats.model_parts import LinearModel
 from shapespace.formats.statismo import model_of, tree_of
 from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import atomic_path, read_bytes
-from shapespace.io.sandbox import SandboxError, Tree
+from shapespace.io.sandbox import FileContent, SandboxError
 
 _AGAIN = "export it again from the original program"
 _LARGEST_BYTES = 2**31  # 2 GiB
@@ -94,7 +94,7 @@ class _File(msgspec.Struct):
     datasets: dict[str, _Dataset] = {}
 
 
-def _tree(text: bytes) -> Tree:
+def _tree(text: bytes) -> FileContent:
     """Return the tree of linked objects from the root; objects without a link are ignored.
 
     Raises:
@@ -132,7 +132,7 @@ def _tree(text: bytes) -> Tree:
                     texts[inner] = value
                 elif value is not None:
                     arrays[inner] = value
-    return Tree(arrays, texts, attributes, tuple(groups))
+    return FileContent(arrays, texts, attributes, tuple(groups))
 
 
 def _attributes(entries: Sequence[_Attribute]) -> dict[str, Any]:
@@ -180,7 +180,7 @@ def _get_item(value: Any, key: str) -> Any:
     return cast(dict[str, Any], value).get(key) if isinstance(value, dict) else None
 
 
-def _text_of(tree: Tree) -> Generator[str]:
+def _text_of(tree: FileContent) -> Generator[str]:
     """Yield the file in pieces; attributes and texts are scalars, since scalismo does not read lists with one item."""
     paths = (*tree.groups, *tree.arrays, *tree.texts)
     known_as = {path: str(uuid.uuid5(uuid.NAMESPACE_URL, f"shapespace:{path}")) for path in paths}

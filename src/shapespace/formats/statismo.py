@@ -32,7 +32,7 @@ from shapespace.io.containers.json_files import check_file
 from shapespace.io.files import write_bytes
 from shapespace.io.landmarks.landmark_io import LANDMARK_FORMATS
 from shapespace.io.meshes.vtk import read_vtk
-from shapespace.io.sandbox import HDF5_SIGNATURE, SandboxError, Tree, read_hdf5_sandboxed
+from shapespace.io.sandbox import HDF5_SIGNATURE, FileContent, SandboxError, read_hdf5_sandboxed
 from shapespace.types import FloatArray, IntArray, Mesh, SurfaceLandmarks
 
 _AGAIN = "export it again from the original program"
@@ -75,7 +75,7 @@ def write_statismo(model: LinearModel, path: Path) -> Sequence[str]:
     return notes
 
 
-def model_of(tree: Tree, path: Path) -> LinearModel:
+def model_of(tree: FileContent, path: Path) -> LinearModel:
     """Return the model in `tree`.
 
     Args:
@@ -106,7 +106,7 @@ class _ModelBlock:
         return Modes(self.moved, total_variance=total)
 
 
-def _model(tree: Tree, path: Path) -> LinearModel:
+def _model(tree: FileContent, path: Path) -> LinearModel:
     root = _root(tree, path)
     part = _part(tree, root)
     mean, expression, notes = part.mean, None, list[str]()
@@ -141,13 +141,13 @@ def _model(tree: Tree, path: Path) -> LinearModel:
     )
 
 
-def _roots(tree: Tree) -> list[str]:
+def _roots(tree: FileContent) -> list[str]:
     """Return the paths of models in the catalogue, without doubled slashes."""
     paths = [text for path, text in tree.texts.items() if path.startswith("/catalog/") and path.endswith("/modelPath")]
     return ["/" + "/".join(part for part in text.split("/") if part) for text in paths]
 
 
-def _root(tree: Tree, path: Path) -> str:
+def _root(tree: FileContent, path: Path) -> str:
     for root in ("/shape", "", *_roots(tree)):
         if f"{root}/model/mean" in tree.arrays:
             return root
@@ -156,7 +156,7 @@ def _root(tree: Tree, path: Path) -> str:
     raise ModelFileError(f"{path} is not a shapespace model or a statismo model: it has no /model/mean.")
 
 
-def _version(tree: Tree, root: str) -> tuple[int, int] | None:
+def _version(tree: FileContent, root: str) -> tuple[int, int] | None:
     for prefix in (root, ""):
         numbers = [tree.arrays.get(f"{prefix}/version/{name}") for name in ("majorVersion", "minorVersion")]
         if all(number is not None and number.size == 1 for number in numbers):
@@ -165,7 +165,7 @@ def _version(tree: Tree, root: str) -> tuple[int, int] | None:
     return None
 
 
-def _part(tree: Tree, root: str) -> _ModelBlock:
+def _part(tree: FileContent, root: str) -> _ModelBlock:
     mean, variance = _array(tree, f"{root}/model/mean").ravel(), _array(tree, f"{root}/model/pcaVariance").ravel()
     basis = _array(tree, f"{root}/model/pcaBasis")
     if basis.shape == (len(variance), len(mean)) != (len(mean), len(variance)):
@@ -198,14 +198,14 @@ def _part(tree: Tree, root: str) -> _ModelBlock:
     return _ModelBlock(mean, displacements, noise * (len(mean) - n_orthogonal))
 
 
-def _array(tree: Tree, path: str) -> FloatArray:
+def _array(tree: FileContent, path: str) -> FloatArray:
     if path not in tree.arrays:
         raise ValueError(f"there is no {path} in it")
     return np.asarray(tree.arrays[path], dtype=np.float64)
 
 
 def _surface(
-    tree: Tree, root: str, mean: FloatArray, notes: list[str]
+    tree: FileContent, root: str, mean: FloatArray, notes: list[str]
 ) -> tuple[FloatArray, IntArray | None, npt.NDArray[np.int64] | None]:
     """Return points (V, 3) of the reference, its triangles or None, and the surface vertices of a solid or None."""
     n = len(mean)
@@ -240,7 +240,7 @@ def _surface(
     return points, cells.astype(np.int32), None
 
 
-def _points(tree: Tree, root: str, mean: FloatArray) -> tuple[FloatArray, bool]:
+def _points(tree: FileContent, root: str, mean: FloatArray) -> tuple[FloatArray, bool]:
     """Return the points (V, 3) of the reference, else of the mean, and whether they are stored in columns."""
     points = tree.arrays.get(f"{root}/{_LEGACY_POINTS}")
     if points is not None and points.shape == mean.shape:
@@ -265,20 +265,20 @@ def _outer_triangles(cells: npt.NDArray[np.int64], mean: FloatArray) -> npt.NDAr
     return sides[np.sort(first[count == 1])]
 
 
-def _mm(tree: Tree, root: str, attributes: Mapping[str, str]) -> float | None:
+def _mm(tree: FileContent, root: str, attributes: Mapping[str, str]) -> float | None:
     length = tree.arrays.get(f"{root}/representer/length-unit")
     if length is not None and length.size == 1 and 0 < float(length.reshape(-1)[0]) < np.inf:
         return round(1000 * float(length.reshape(-1)[0]), 9)
     return 1.0 if attributes.get("unit") == "mm" or root == "/shape" else None
 
 
-def _parameters(tree: Tree, root: str) -> dict[str, str]:
+def _parameters(tree: FileContent, root: str) -> dict[str, str]:
     """Return the metadata that `write_statismo` stores."""
     start = f"{root}/{_PARAMETERS}/"
     return {path.removeprefix(start): text for path, text in tree.texts.items() if path.startswith(start)}
 
 
-def _n_training(tree: Tree, root: str, part: _ModelBlock, parameters: Mapping[str, str]) -> int | None:
+def _n_training(tree: FileContent, root: str, part: _ModelBlock, parameters: Mapping[str, str]) -> int | None:
     if parameters.get("n_training", "").isdecimal():
         return int(parameters["n_training"][:9])
     scores = tree.arrays.get(f"{root}/modelinfo/scores")
@@ -288,7 +288,7 @@ def _n_training(tree: Tree, root: str, part: _ModelBlock, parameters: Mapping[st
 
 
 def _landmarks(
-    tree: Tree, surfaces: Sequence[FloatArray], faces: IntArray | None, notes: list[str], path: Path
+    tree: FileContent, surfaces: Sequence[FloatArray], faces: IntArray | None, notes: list[str], path: Path
 ) -> SurfaceLandmarks:
     """Return the landmarks of the file, which are points, on the surface to which they are nearest.
 
@@ -314,7 +314,7 @@ def _landmarks(
     return best.select([name for name, is_there in zip(best.names, is_on_surface, strict=True) if is_there])
 
 
-def _landmark_points(tree: Tree, path: Path) -> dict[str, FloatArray]:
+def _landmark_points(tree: FileContent, path: Path) -> dict[str, FloatArray]:
     for kind in ("json", "text"):
         text = tree.texts.get(f"/metadata/landmarks/{kind}", "")
         if not text.strip():
@@ -380,15 +380,15 @@ class _TreeBuilder:
             self.texts[f"/catalog/MorphableModel.{name}/modelType"] = "POLYGON_MESH_MODEL"
             self.texts[f"/catalog/MorphableModel.{name}/modelPath"] = f"/{name}"
 
-    def tree(self) -> Tree:
+    def tree(self) -> FileContent:
         groups = ["/"]
         for path in [*self.arrays, *self.texts, *(f"{group}/" for group in self.groups)]:
             parents = path.split("/")[1:-1]
             groups += ["/" + "/".join(parents[:count]) for count in range(1, len(parents) + 1)]
-        return Tree(self.arrays, self.texts, self.attributes, tuple(dict.fromkeys(groups)))
+        return FileContent(self.arrays, self.texts, self.attributes, tuple(dict.fromkeys(groups)))
 
 
-def tree_of(model: LinearModel) -> tuple[Tree, list[str]]:
+def tree_of(model: LinearModel) -> tuple[FileContent, list[str]]:
     """Return the tree of `model` in version 0.9 and single precision, and sentences about changed or omitted data.
 
     With expressions it is a Morphable Model of scalismo-faces, with a grey placeholder for the required colour model.
@@ -426,7 +426,7 @@ def tree_of(model: LinearModel) -> tuple[Tree, list[str]]:
     return growing.tree(), notes
 
 
-def _hdf5_of(tree: Tree) -> bytes:
+def _hdf5_of(tree: FileContent) -> bytes:
     """Return `tree` as an HDF5 file; texts and attributes are null-terminated scalars of fixed length."""
     import h5py  # slow import (0.05 s), needed for writing only
 

@@ -269,7 +269,7 @@ _NAMED = 3  # names in a message
 
 
 @dataclass(frozen=True, eq=False)
-class Sides:
+class ScanSides:
     """Chirality of the scans of a collection.
 
     Args:
@@ -285,7 +285,7 @@ class Sides:
     asymmetry: float = 0.0
 
 
-def solve_sides(scores: FloatArray, anchors: Sequence[int], seed: int) -> Sides:
+def solve_sides(scores: FloatArray, anchors: Sequence[int], seed: int) -> ScanSides:
     """Return the sides that agree best with the scores of all comparisons.
 
     Args:
@@ -312,7 +312,7 @@ def solve_sides(scores: FloatArray, anchors: Sequence[int], seed: int) -> Sides:
     for a, i in enumerate(anchors):
         if decided and i >= 0:
             mirrored[i] = signs[a] < 0
-    return Sides(np.asarray(mirrored), np.abs(margin), bool(decided), asymmetry)
+    return ScanSides(np.asarray(mirrored), np.abs(margin), bool(decided), asymmetry)
 
 
 def mirrored_note(shape: Callable[[int], FloatArray], name: Callable[[int], str], count: int) -> list[str]:

@@ -42,7 +42,7 @@ class SandboxError(ValueError):
 
 
 @dataclass(frozen=True)
-class Tree:
+class FileContent:
     """Content of an HDF5 file, or of a file with the same structure, by path: "/model/mean".
 
     Args:
@@ -58,7 +58,7 @@ class Tree:
     groups: Sequence[str] = ("/",)
 
 
-def read_hdf5_sandboxed(path: Path, leave: Sequence[str] = ()) -> Tree:
+def read_hdf5_sandboxed(path: Path, leave: Sequence[str] = ()) -> FileContent:
     """Return the content of an HDF5 file, without the paths in `leave` and without objects of unsupported types.
 
     Raises:
@@ -68,7 +68,7 @@ def read_hdf5_sandboxed(path: Path, leave: Sequence[str] = ()) -> Tree:
     return _read(path, {"kind": "hdf5", "leave": list(leave)})
 
 
-def read_matlab_sandboxed(path: Path, variables: Sequence[str]) -> Tree:
+def read_matlab_sandboxed(path: Path, variables: Sequence[str]) -> FileContent:
     """Return those of `variables` that a MATLAB file of version 4 to 7 contains, structures as groups.
 
     Raises:
@@ -78,7 +78,7 @@ def read_matlab_sandboxed(path: Path, variables: Sequence[str]) -> Tree:
     return _read(path, {"kind": "matlab", "wanted": list(variables)})
 
 
-def read_pickle_sandboxed(path: Path, names: Sequence[str]) -> Tree:
+def read_pickle_sandboxed(path: Path, names: Sequence[str]) -> FileContent:
     """Return those arrays of `names` that the dictionary in a pickle contains; no code of the pickle is called.
 
     Raises:
@@ -88,7 +88,7 @@ def read_pickle_sandboxed(path: Path, names: Sequence[str]) -> Tree:
     return _read(path, {"kind": "pickle", "wanted": list(names)})
 
 
-def _read(path: Path, request: dict[str, Any]) -> Tree:
+def _read(path: Path, request: dict[str, Any]) -> FileContent:
     with open_file(path) as stream:
         size = os.fstat(stream.fileno()).st_size
         most_bytes = min(SPARE_BYTES + GROWTH * size, MOST_BYTES)
@@ -118,7 +118,7 @@ def _read(path: Path, request: dict[str, Any]) -> Tree:
     return _tree(completed.stdout)
 
 
-def _tree(output: bytes) -> Tree:
+def _tree(output: bytes) -> FileContent:
     head, newline, _ = output.partition(b"\n") if len(output) < 2**16 else (output[: output.find(b"\n")], b"\n", b"")
     if not newline or not head:
         raise SandboxError("the library that reads it crashes")
@@ -134,4 +134,4 @@ def _tree(output: bytes) -> Tree:
             raise SandboxError("the library that reads it crashes")
         arrays[path] = np.frombuffer(output, dtype, count, offset).reshape(shape)
         offset += count * dtype.itemsize
-    return Tree(arrays, header["texts"], header["attributes"], tuple(header["groups"]))
+    return FileContent(arrays, header["texts"], header["attributes"], tuple(header["groups"]))

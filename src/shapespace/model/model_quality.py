@@ -294,7 +294,7 @@ def _observed_part(shape: Mesh, seen: IntArray) -> Mesh:
 
 
 @dataclass(frozen=True)
-class Part:
+class QualityTask:
     """An independent part of a measurement: a fold, or some random shapes.
 
     Args:
@@ -371,19 +371,19 @@ class Shapes:
         """Training shapes in the pose of the model."""
         return _Nearest.of(_pose_shapes(self.space, self.trained, self.config), self.space.n_vertices)
 
-    def parts(self) -> list[Part]:
+    def parts(self) -> list[QualityTask]:
         """Return all parts of the work, in the order of the output."""
         n, rng = len(self.meshes), np.random.default_rng(self.config.seed + 1)
-        folds: list[Part] = []
+        folds: list[QualityTask] = []
         for fold in self.folds:
             order = tuple(int(i) for i in rng.permutation(n) if i not in fold)
-            folds.append(Part(tuple(fold.tolist()), order))
+            folds.append(QualityTask(tuple(fold.tolist()), order))
         samples = range(self.config.samples)
         return folds + [
-            Part(drawn=tuple(samples[start : start + _DRAWN_AT_ONCE])) for start in samples[::_DRAWN_AT_ONCE]
+            QualityTask(drawn=tuple(samples[start : start + _DRAWN_AT_ONCE])) for start in samples[::_DRAWN_AT_ONCE]
         ]
 
-    def do(self, part: Part) -> FloatArray:
+    def do(self, part: QualityTask) -> FloatArray:
         """Return errors, mm: of held-out shapes (H, n + m, 2), the last m for fewer training shapes; or of random ones.
 
         Raises:
@@ -391,7 +391,7 @@ class Shapes:
         """
         return self._measure_held_out(part) if part.held else self._measure_drawn(part)
 
-    def _measure_held_out(self, part: Part) -> FloatArray:
+    def _measure_held_out(self, part: QualityTask) -> FloatArray:
         held = [self.targets[i] for i in part.held]
         space = self.config.space([self.meshes[i] for i in sorted(part.order)])
         out = np.zeros((len(held), len(self.counts) + len(self.sizes), 2))
@@ -404,7 +404,7 @@ class Shapes:
                 out[row, column] = _errors_by_modes(fewer, target.cut_to(fewer), only, surface=False)[0]
         return out
 
-    def _measure_drawn(self, part: Part) -> FloatArray:
+    def _measure_drawn(self, part: QualityTask) -> FloatArray:
         """Return the distances (S, n, 2), mm, of random shapes from the nearest training shape."""
         model, counts = self.space, self.few_counts
         mean, modes = model.mean_vertices, np.ascontiguousarray(model.vertex_basis.T)
@@ -415,11 +415,11 @@ class Shapes:
         return out
 
 
-Runner: TypeAlias = Callable[[Shapes, Sequence[Part]], Iterable[tuple[Part, FloatArray]]]
+Runner: TypeAlias = Callable[[Shapes, Sequence[QualityTask]], Iterable[tuple[QualityTask, FloatArray]]]
 """Function that does the parts of a measurement, in any process, and yields each with its errors, in any order."""
 
 
-def run_here(shapes: Shapes, parts: Sequence[Part]) -> Iterable[tuple[Part, FloatArray]]:
+def run_here(shapes: Shapes, parts: Sequence[QualityTask]) -> Iterable[tuple[QualityTask, FloatArray]]:
     """Do one part after the other in this process."""
     return ((part, shapes.do(part)) for part in parts)
 

@@ -43,7 +43,7 @@ _TIED = 1.0 - 1e-6
 """Entries this close to a mode's largest tie with it, as left and right do in symmetric shapes."""
 
 
-class Table(Protocol):
+class RowTable(Protocol):
     """N rows of D numbers, one shape per row, in memory or in a file (`Spill`)."""
 
     rows: int
@@ -122,7 +122,7 @@ def modes_for_variance(variance: FloatArray, share: float, total: float | None =
 
 
 def principal_components(
-    shapes: FloatArray | Table,
+    shapes: FloatArray | RowTable,
     modes: Modes = "all",
     *,
     seed: int = 0,
@@ -260,12 +260,12 @@ class Covariance:
         squares: sum of all squares.
     """
 
-    table: Table
+    table: RowTable
     mean: FloatArray
     squares: float
 
     @staticmethod
-    def of(table: Table) -> Covariance:
+    def of(table: RowTable) -> Covariance:
         """Compute mean and squares in one pass over the rows.
 
         Raises:

@@ -24,7 +24,7 @@ _MAX_PARTS = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class ModelRegion:
     """A part of a model.
 
     Args:
@@ -38,7 +38,7 @@ class Part:
     lift: FloatArray
 
     @staticmethod
-    def of(full: ShapeModel, region: str | tuple[int, ...]) -> Part:
+    def of(full: ShapeModel, region: str | tuple[int, ...]) -> ModelRegion:
         """Return the part of `full` in `region`, one of its regions by name or vertices.
 
         Raises:
@@ -66,7 +66,7 @@ class Part:
 
 
 @cached_with_owner(limit=_MAX_PARTS)
-def _build_part(full: ShapeModel, region: str | tuple[int, ...]) -> Part:
+def _build_part(full: ShapeModel, region: str | tuple[int, ...]) -> ModelRegion:
     if isinstance(region, str):
         if region not in full.regions:
             there = f"it has {', '.join(full.regions)}" if full.regions else "it has none"
@@ -99,4 +99,4 @@ def _build_part(full: ShapeModel, region: str | tuple[int, ...]) -> Part:
         held_out=full.held_out,
         is_n_training_known=full.is_n_training_known,
     )
-    return Part(model, inside, lift[significant].T)
+    return ModelRegion(model, inside, lift[significant].T)

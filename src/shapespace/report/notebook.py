@@ -14,7 +14,7 @@ from shapespace.model.model_quality import Curve, ModelQuality
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report import figures
 from shapespace.report.analyses.result_report import analysis_report
-from shapespace.report.blocks.blocks import Block, Cell, Column, Notes, Table, Text
+from shapespace.report.blocks.blocks import Block, Cell, Head, Notes, Table, Text
 from shapespace.report.blocks.wording import listed, mm, percent, training_text
 from shapespace.report.inputs.saved_fits import Folder, StagedFit
 from shapespace.report.pages.page import Page, template
@@ -344,7 +344,7 @@ def html_of_predictions(predictions: Predictions) -> str:
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], caption: str, total: int) -> list[Block]:
     """Return a table of the first of `total` rows, and how many there are beyond them."""
     cells = [[Cell(text) for text in row] for row in rows]
-    return _shorten(Table([Column(head) for head in heads], cells, caption), total, "more")
+    return _shorten(Table([Head(head) for head in heads], cells, caption), total, "more")
 
 
 def _shorten(table: Table, total: int, rest: str = "more rows") -> list[Block]:

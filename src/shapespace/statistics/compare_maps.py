@@ -21,7 +21,7 @@ from shapespace.lazy import require_package
 from shapespace.reprs import short_repr
 from shapespace.statistics.compare_formula import INSTALL
 from shapespace.statistics.compare_strata import Stratum
-from shapespace.statistics.dispersion import Estimate
+from shapespace.statistics.dispersion import EffectEstimate
 from shapespace.statistics.tolerances import TIE
 from shapespace.types import BoolArray, FloatArray, Mesh, read_only
 
@@ -120,7 +120,7 @@ def effect_maps(
     bump_width_mm: float | None = None,
     weights: FloatArray | None = None,
     *,
-    estimates: Sequence[Estimate] | None = None,
+    estimates: Sequence[EffectEstimate] | None = None,
     alpha: float = 0.05,
 ) -> Sequence[EffectMap]:
     """Return the maps of E effects that share the other terms of the model; memory does not grow with P times V.

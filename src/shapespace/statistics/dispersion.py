@@ -250,14 +250,14 @@ class UnequalVariances:
         """(permutations, m, K) products of `full` with the flipped residuals."""
         return self.products(self.full)
 
-    def estimate(self, own: FloatArray) -> Estimate:
+    def estimate(self, own: FloatArray) -> EffectEstimate:
         """Return the size and the variance of an estimate along `own` (n, q), orthonormal columns within `full`."""
         weights = (own**2).sum(axis=1) / np.maximum(1.0 - self.leverage, FULL_LEVERAGE)
-        return Estimate(self, own.T @ self.full, weights)
+        return EffectEstimate(self, own.T @ self.full, weights)
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class EffectEstimate:
     """The size of an estimate and its variance, in sign flips of residuals.
 
     Args:
@@ -402,7 +402,7 @@ def welch_flips(
     mean = np.full((len(maps), 1), len(maps) ** -0.5)
     own = np.linalg.svd(full - mean @ (mean.T @ full), full_matrices=False)[0][:, :1]
 
-    def estimate(values: FloatArray) -> Estimate:
+    def estimate(values: FloatArray) -> EffectEstimate:
         groups = second.astype(np.intp)
         return unequal_variances(values, full, mean, groups, permutations, seed, "groups").estimate(own)
 

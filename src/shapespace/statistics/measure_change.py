@@ -88,7 +88,7 @@ def change(
     groups = _groups(cohort, config, visits, single)
     stable = stable_vertices(cohort, config.stable)
     regions = _regions(cohort, config)
-    problem = _Problem(
+    problem = _SharedEstimates(
         cohort=cohort,
         landmarks=cohort.landmarks or SurfaceLandmarks(),
         regions=np.stack([_indicator(vertices, cohort.n_vertices) for vertices in regions.values()]),
@@ -168,7 +168,7 @@ def _is_model_only(cohort: Cohort) -> bool:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _Problem:
+class _SharedEstimates:
     """Input that the estimates of all subjects have in common.
 
     Args:
@@ -228,7 +228,7 @@ class _SubjectDraft:
         )
 
 
-def _draft(problem: _Problem, name: str, subject: AlignedVisits) -> _SubjectDraft:
+def _draft(problem: _SharedEstimates, name: str, subject: AlignedVisits) -> _SubjectDraft:
     """Return the changes of a subject, with standard deviations unless these are estimated from rescans."""
     faces, first = faces_in(problem.cohort), subject.means[0]
     area = vertex_areas(Mesh(first, faces))
@@ -273,7 +273,7 @@ def _draft(problem: _Problem, name: str, subject: AlignedVisits) -> _SubjectDraf
 
 
 def _uncertainty(
-    problem: _Problem, subject: AlignedVisits, weights: FloatArray, noise_ratio: float
+    problem: _SharedEstimates, subject: AlignedVisits, weights: FloatArray, noise_ratio: float
 ) -> ChangeUncertainty:
     """Return the standard deviations of a sum over visits by `weights` (T,); 0 if rescans replace them.
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from shapespace.io.tables.table_io import CHECKSUM
-from shapespace.schemas import Distances, FitRecord, Pose
+from shapespace.schemas import Distances, FitRecord, PoseRecord
 
 _DIRECTIONS = ("model_to_scan", "scan_to_model")
 _DISTANCE_COLUMNS = ("mean", "median", "rms", "p95", "max", "count")
@@ -116,7 +116,7 @@ def _overlap_cells(record: FitRecord) -> dict[str, Any]:
     return cells
 
 
-def _pose_cells(pose: Pose) -> dict[str, float]:
+def _pose_cells(pose: PoseRecord) -> dict[str, float]:
     """Return scale, rotation vector (its direction the axis, its length the angle in degrees) and translation."""
     from scipy.spatial.transform import Rotation  # a tenth of a second that only those who fit should wait
 

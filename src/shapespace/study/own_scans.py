@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.batch.executors import ExecutionConfig
-from shapespace.batch.fit_work import Job
+from shapespace.batch.fit_work import FitJob
 from shapespace.batch.progress import progress
 from shapespace.batch.run import BatchConfig, FolderSink, fit_many, make_jobs
 from shapespace.datasets.expression_sets import ScanEntry, scan_set
@@ -74,7 +74,7 @@ def run_own_study(
     model, additive = (loaded, None) if isinstance(loaded, ShapeModel) else (loaded.shape, loaded)
     with progress(len(labelled.scans), "fitting", "scan", quiet=quiet) as bar:
 
-        def fitted(job: Job, record: FitRecord) -> None:
+        def fitted(job: FitJob, record: FitRecord) -> None:
             bar.update()
 
         jobs = make_jobs([entry.path for entry in labelled.scans])

@@ -19,7 +19,7 @@ from shapespace.report.blocks.wording import sentence, without_folders
 from shapespace.report.inputs.correspondence_folder import (
     Concern,
     Corresponded,
-    Population,
+    SurfacePopulation,
     concerns_of,
     distance_share,
     scan_status,
@@ -109,7 +109,7 @@ class Surfaces:
             arrays["std"] = 100 * population.position_std
         return pack(arrays, {"scans": len(population.names), "std_limit": population.position_std_limit})
 
-    def _population(self) -> Population:
+    def _population(self) -> SurfacePopulation:
         with self._lock:
             self._corresponded.turn_upright()
         with self._summary_lock:  # surfaces are sent in the meantime

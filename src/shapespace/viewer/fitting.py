@@ -78,7 +78,7 @@ def fit_upload(pipe: Connection, upload: Upload) -> None:
     from msgspec import structs
 
     from shapespace.batch.fit_records import write_record
-    from shapespace.batch.fit_work import Job, fit_file
+    from shapespace.batch.fit_work import FitJob, fit_file
     from shapespace.errors import ShapespaceError
     from shapespace.fit.fit_scan import FitConfig
     from shapespace.fit.iteration_state import IcpState
@@ -104,7 +104,7 @@ def fit_upload(pipe: Connection, upload: Upload) -> None:
     # A file that cannot be read cannot be fitted either, and the record contains the reason.
     with contextlib.suppress(ShapespaceError, MemoryError):
         send("scan", **_preview(model, upload))
-    job, config = Job(NAME, upload.scan, upload.landmarks), FitConfig(dense=upload.dense)
+    job, config = FitJob(NAME, upload.scan, upload.landmarks), FitConfig(dense=upload.dense)
     record = fit_file(job, model, upload.model, upload.folder, config, stages=True, on_state=on_state)
     # Our own names and folders mean nothing to the user.
     record = structs.replace(

@@ -89,7 +89,7 @@ def serve(
     from shapespace.viewer.corresponding_surfaces import Surfaces
     from shapespace.viewer.model_view import ModelView
     from shapespace.viewer.server import make_app, make_surfaces_app
-    from shapespace.viewer.uploaded_scans import FOLDER_PREFIX, Limits, Scans
+    from shapespace.viewer.uploaded_scans import FOLDER_PREFIX, Scans, UploadLimits
 
     with _end_by_signals(), ExitStack() as stack:
         if has_surfaces:
@@ -97,7 +97,7 @@ def serve(
         else:
             view = ModelView.open(path, model)
             root = Path(stack.enter_context(TemporaryDirectory(prefix=FOLDER_PREFIX, ignore_cleanup_errors=True)))
-            scans = Scans(root, view.model, view.model_name, Limits(upload_bytes=max_upload_mb * 2**20))
+            scans = Scans(root, view.model, view.model_name, UploadLimits(upload_bytes=max_upload_mb * 2**20))
             stack.callback(scans.close)
             make = partial(make_app, view, scans)
         _run(make, "viewer", host, port, open_browser=open_browser, say=say)

@@ -27,7 +27,7 @@ _STATUSES_TO_REFIT = ("doubtful", "failed", "max_iterations")
 
 
 @dataclass(frozen=True)
-class Limits:
+class UploadLimits:
     """Bounds on uploads and fits.
 
     Args:
@@ -98,12 +98,12 @@ class Scans:
         root: Path,
         model: ShapeModel,
         model_name: str,
-        limits: Limits | None = None,
+        limits: UploadLimits | None = None,
         *,
         worker: Worker = fit_upload,
     ) -> None:
         self.root = root
-        self.limits = limits or Limits()
+        self.limits = limits or UploadLimits()
         self._model_name = model_name
         self._has_landmarks = len(model.landmarks) >= MIN_LANDMARKS
         self._worker = worker

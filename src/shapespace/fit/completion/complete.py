@@ -40,7 +40,7 @@ from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.interop import MeshLike
 from shapespace.io.landmarks.landmark_io import read_landmarks
 from shapespace.io.memory_cache import cached_with_owner
-from shapespace.model.region import Part
+from shapespace.model.region import ModelRegion
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import describe_briefly
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
@@ -382,7 +382,7 @@ def complete(
     dense = dense_surface(model, target, start, T, config.fit.dense_settings)
     observed = dense.seen.copy()
     if config.part is not None:
-        observed[Part.of(model, config.part).inside] = False
+        observed[ModelRegion.of(model, config.part).inside] = False
     calibration = calibrate(posterior, model, ~observed)
     status, reasons = _judge_completion(fit, posterior, calibration, dense.noise_mm, apart_mm, config)
     notes = [*fit.notes, *_describe_missing_parts(model, fit, observed, with_scale=with_scale)]
@@ -572,7 +572,7 @@ def _remove_part(fit: FitResult, part: str) -> Mesh:
         InputError: there is no such region.
         FitError: no point is left.
     """
-    inside = Part.of(fit.model, part).inside
+    inside = ModelRegion.of(fit.model, part).inside
     surface = fit.surface()
     near = build_engine(surface).query(fit.scan.vertices)
     outside = ~inside[near.vertex]

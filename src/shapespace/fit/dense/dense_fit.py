@@ -274,7 +274,7 @@ def dense_surface(
 
 
 @dataclass(frozen=True, eq=False)
-class WeightedMatches:
+class FieldMatches:
     """Matches of the surface, with the spread and the noise of their residuals.
 
     Args:
@@ -313,7 +313,7 @@ class WeightedMatches:
 
 def _first_matches(
     target: ScanTarget, surface: ModelSurface, T: Similarity, settings: DenseSettings
-) -> tuple[Matcher, WeightedMatches]:
+) -> tuple[Matcher, FieldMatches]:
     """Return the matcher, with triangles that are flat or stand for a smooth surface, and the first matches.
 
     Raises:
@@ -341,7 +341,7 @@ def _build_matcher(target: ScanTarget, topology: Topology, settings: DenseSettin
 
 def _match_surface(
     matcher: Matcher, surface: ModelSurface, T: Similarity, hint: MatchHint, settings: DenseSettings
-) -> WeightedMatches:
+) -> FieldMatches:
     """Return the matches of the surface, and the spread and the noise of their residuals.
 
     Raises:
@@ -359,14 +359,14 @@ def _match_surface(
     pairs = nearest[points[1:]] == nearest[points[:-1]]
     differences = np.diff(residual[points])[pairs]
     noise_mm = spread(differences) / np.sqrt(2.0) if len(differences) >= _FEWEST_PAIRS else spread_mm
-    return WeightedMatches(
+    return FieldMatches(
         matches, surface.topology.faces, len(surface.vertices), settings, spread_mm,
         max(noise_mm, settings.least_noise_mm),
     )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
-class Field:
+class MaternField:
     """A Matern field on a surface, with precision A M^-1 A.
 
     Args:
@@ -401,7 +401,7 @@ class _Laplacian:
     area: FloatArray
 
 
-def _matern_field(model: ShapeModel, range_mm: float, amplitude_mm: float) -> Field:
+def _matern_field(model: ShapeModel, range_mm: float, amplitude_mm: float) -> MaternField:
     """Return the field with that standard deviation and range on the mean of `model`."""
     t = prepare(model).topology
     laplacian = _mean_laplacian(model)
@@ -412,7 +412,7 @@ def _matern_field(model: ShapeModel, range_mm: float, amplitude_mm: float) -> Fi
     inverse = 1.0 / laplacian.area
     rows = np.repeat(np.arange(len(diagonal)), np.diff(t.ring_start))
     stiffness = diagonal**2 * inverse + np.bincount(rows, off_diagonal**2 * inverse[t.ring], len(diagonal))
-    return Field(t, off_diagonal, diagonal, inverse, stiffness)
+    return MaternField(t, off_diagonal, diagonal, inverse, stiffness)
 
 
 @cached_with_owner()

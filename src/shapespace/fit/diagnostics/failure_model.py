@@ -178,7 +178,7 @@ _E = TypeVar("_E", bound=MatchEvidence, contravariant=True)
 
 
 @dataclass(frozen=True)
-class Term(Generic[_E]):
+class PredictorTerm(Generic[_E]):
     """One term of a linear function of predictors: weight * (max(predictor, lowest) - usual).
 
     Args:
@@ -203,7 +203,7 @@ class Term(Generic[_E]):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScoreTerm(Term[MatchEvidence]):
+class ScoreTerm(PredictorTerm[MatchEvidence]):
     """A term of the score.
 
     Args:
@@ -301,15 +301,15 @@ SCORE_TERMS = (
 
 # Shares of the scan are no predictors of the error, since hair and collars lower those too.
 ERROR_OFFSET = 2.103
-ERROR_TERMS: Mapping[str, Term[ScanEvidence]] = {
-    "posterior error": Term(_posterior_error, 0.995, math.log(1e-4)),
-    "residual spread": Term(_residual_spread, 0.222, math.log(1e-4)),
-    "residual spread over model spread": Term(
+ERROR_TERMS: Mapping[str, PredictorTerm[ScanEvidence]] = {
+    "posterior error": PredictorTerm(_posterior_error, 0.995, math.log(1e-4)),
+    "residual spread": PredictorTerm(_residual_spread, 0.222, math.log(1e-4)),
+    "residual spread over model spread": PredictorTerm(
         lambda e: _log(e.spread_mm / max(e.model_spread_mm, 1e-9)), 0.163, math.log(1e-4)
     ),
-    "model lack": Term(lambda e: _log(e.model_lack_mm / e.size_mm), 0.129, math.log(1e-3)),
-    "all modes": Term(_all_modes, 0.244, 0.0),
-    "layered share": Term(lambda e: e.layered_share, 2.762),
+    "model lack": PredictorTerm(lambda e: _log(e.model_lack_mm / e.size_mm), 0.129, math.log(1e-3)),
+    "all modes": PredictorTerm(_all_modes, 0.244, 0.0),
+    "layered share": PredictorTerm(lambda e: e.layered_share, 2.762),
 }
 INTERVAL = 0.594, 2.292
 """Ends of the interval as multiples of the expected error."""

@@ -133,7 +133,7 @@ def _best_rotations(H: FloatArray) -> FloatArray:
     return U @ Vt
 
 
-class Step(NamedTuple):
+class SearchStep(NamedTuple):
     """Settings of one step of the search.
 
     Args:
@@ -158,13 +158,13 @@ class Step(NamedTuple):
 
 
 # Chosen on simulated scans of people who are not in the tests.
-GLANCE = Step(points=250, widest=0.3, narrowest=0.04, iterations=14, modes=10, n_poses=1)
-FLIPS = Step(points=90, widest=0.3, narrowest=0.06, iterations=6, modes=3, n_poses=1)
-COARSE = Step(points=250, widest=0.5, narrowest=0.1, iterations=10, modes=0, n_poses=30)
-RIGID = Step(points=500, widest=0.2, narrowest=0.06, iterations=14, modes=0, n_poses=24)
-MIDDLE = Step(points=200, widest=0.3, narrowest=0.06, iterations=12, modes=3, n_poses=5)
-FINE = Step(points=400, widest=0.1, narrowest=0.03, iterations=10, modes=10, n_poses=2)
-LONG = Step(points=400, widest=0.15, narrowest=0.03, iterations=30, modes=10, n_poses=4)
+GLANCE = SearchStep(points=250, widest=0.3, narrowest=0.04, iterations=14, modes=10, n_poses=1)
+FLIPS = SearchStep(points=90, widest=0.3, narrowest=0.06, iterations=6, modes=3, n_poses=1)
+COARSE = SearchStep(points=250, widest=0.5, narrowest=0.1, iterations=10, modes=0, n_poses=30)
+RIGID = SearchStep(points=500, widest=0.2, narrowest=0.06, iterations=14, modes=0, n_poses=24)
+MIDDLE = SearchStep(points=200, widest=0.3, narrowest=0.06, iterations=12, modes=3, n_poses=5)
+FINE = SearchStep(points=400, widest=0.1, narrowest=0.03, iterations=10, modes=10, n_poses=2)
+LONG = SearchStep(points=400, widest=0.15, narrowest=0.03, iterations=30, modes=10, n_poses=4)
 ROTATIONS = 96  # spread evenly over SO(3), about 55 degrees apart
 
 _MODEL_CELL, _SCAN_CELL = 0.07, 0.04  # grid cells for thinning, as shares of the model's size
@@ -186,7 +186,7 @@ _MORE_ROUNDS = 3  # repetitions of the last step for ambiguous poses
 
 
 @dataclass(frozen=True, eq=False)
-class Pose:
+class PoseCandidate:
     """A pose with adapted coefficients, and its score.
 
     Args:
@@ -204,7 +204,7 @@ class Pose:
 
 def search(
     model: ShapeModel, scan_vertices_mm: FloatArray, *, with_scale: bool, seed: int, quick: bool = False
-) -> tuple[Pose, list[Pose]]:
+) -> tuple[PoseCandidate, list[PoseCandidate]]:
     """Return the pose found without a rotation, and distinct poses of the complete search, best first.
 
     If the pose without a rotation is clearly right, only its likeliest confusions are tested; if no other pose is
@@ -232,9 +232,9 @@ def refine(
     starts: Sequence[Similarity],
     *,
     with_scale: bool,
-    step: Step = LONG,
+    step: SearchStep = LONG,
     seed: int = 0,
-) -> list[Pose]:
+) -> list[PoseCandidate]:
     """Return the poses after one step of the search from each of `starts`, in their order.
 
     Args:
@@ -249,7 +249,7 @@ def refine(
     return [sides.refined(step, T.rotation, T.translation, T.scale) for T in starts]
 
 
-def _score(pose: Pose) -> float:
+def _score(pose: PoseCandidate) -> float:
     return pose.score_mm
 
 
@@ -321,26 +321,26 @@ class _Sides:
         slack = np.array([1.5 * max(spacing, 0.5 * side.spacing), 1.2 * side.spacing])
         return _Sides(side, scan, KdTree(scan), slack, with_scale)
 
-    def upright(self) -> Pose:
+    def upright(self) -> PoseCandidate:
         """Return the better of two poses without rotation: aligned centroids, or aligned outermost parts."""
         R, t = self._place_rotations(np.eye(3)[None])
         pose = self.refined(GLANCE, R[0], t[0])
         return pose if self.is_close(pose) else min(pose, self.refined(GLANCE, R[1], t[1]), key=_score)
 
-    def is_close(self, pose: Pose) -> bool:
+    def is_close(self, pose: PoseCandidate) -> bool:
         """Return whether the score is so good that only flipped poses remain to be tested."""
         return pose.score_mm <= _CLEARLY_CLOSE * _CAP * self.model.size
 
-    def flips(self, pose: Pose) -> list[Pose]:
+    def flips(self, pose: PoseCandidate) -> list[PoseCandidate]:
         """Return the poses rotated by 180 degrees about each axis of the model, its likeliest confusions."""
-        out: list[Pose] = []
+        out: list[PoseCandidate] = []
         T, centre = pose.T_scan_model, self.model.points.mean(axis=0)
         for axis in self.model.axes:
             R = T.rotation @ (2 * np.outer(axis, axis) - np.eye(3))
             out.append(self.refined(FLIPS, R, T.apply(centre) - T.scale * R @ centre, T.scale))
         return out
 
-    def everywhere(self, upright: Pose, *, quick: bool) -> list[Pose]:
+    def everywhere(self, upright: PoseCandidate, *, quick: bool) -> list[PoseCandidate]:
         """Return distinct poses, best first, of a search over all rotations; `quick` as for `search`."""
         grid, size = NearGrid.of(self.scan, self.model.size), self.model.size
         R, t = self._place_rotations(_even_rotations(ROTATIONS))
@@ -384,7 +384,7 @@ class _Sides:
             )
         return distinct_poses
 
-    def upright_unless_clearly_worse(self, upright: Pose, ranked: list[Pose]) -> list[Pose]:
+    def upright_unless_clearly_worse(self, upright: PoseCandidate, ranked: list[PoseCandidate]) -> list[PoseCandidate]:
         """Return `ranked` with the pose nearest to `upright` first, unless the best is clearly better."""
         limit = max(ranked[0].score_mm / _CLEARLY_WORSE, ranked[0].score_mm + _WORTH * _CAP * self.model.size)
         similar = [pose for pose in ranked if len(_select_distinct([upright, pose], 2, _SAME_TURN)) == 1]
@@ -409,13 +409,13 @@ class _Sides:
             translations += [centre - rotations @ part for part in _parts(points, round(share * len(points)))]
         return np.concatenate([rotations] * len(translations)), np.concatenate(translations)
 
-    def _refine_again(self, step: Step, pose: Pose) -> Pose:
+    def _refine_again(self, step: SearchStep, pose: PoseCandidate) -> PoseCandidate:
         T = pose.T_scan_model
         return self.refined(step, T.rotation, T.translation, T.scale, pose.b)
 
     def refined(
-        self, step: Step, R: FloatArray, t: FloatArray, scale: float = 1.0, b: FloatArray | None = None
-    ) -> Pose:
+        self, step: SearchStep, R: FloatArray, t: FloatArray, scale: float = 1.0, b: FloatArray | None = None
+    ) -> PoseCandidate:
         """Return the pose after `step`, from a pose and the coefficients `b` of the leading modes."""
         start_pose = Similarity(scale, R, t)
         shape = self.model.shapes[min(step.modes, max(self.model.shapes))]
@@ -429,8 +429,8 @@ class _Sides:
             1.0 / _SCALE_STDDEV**2 if self.with_scale else math.inf, self.slack, _CAP * self.model.size, out,
         )  # fmt: skip
         if not np.isfinite(out).all():
-            return Pose(start_pose, np.zeros(len(free)), math.inf, 0.0)
-        return Pose(Similarity(scale, R, t), free, 0.5 * float(out[0] + out[1]), float(out[2]))
+            return PoseCandidate(start_pose, np.zeros(len(free)), math.inf, 0.0)
+        return PoseCandidate(Similarity(scale, R, t), free, 0.5 * float(out[0] + out[1]), float(out[2]))
 
 
 def _parts(points: FloatArray, count: int) -> FloatArray:
@@ -442,15 +442,15 @@ def _parts(points: FloatArray, count: int) -> FloatArray:
     return np.stack([points[order[: max(count, 1)]].mean(axis=0) for order in distance.argsort(axis=0).T])
 
 
-def _best_distinct(poses: Sequence[Pose]) -> list[Pose]:
+def _best_distinct(poses: Sequence[PoseCandidate]) -> list[PoseCandidate]:
     return _select_distinct(sorted(poses, key=_score), LONG.n_poses, _OTHER_TURN)
 
 
-def _is_sure(poses: Sequence[Pose]) -> bool:
+def _is_sure(poses: Sequence[PoseCandidate]) -> bool:
     return len(poses) < 2 or poses[0].score_mm <= _SURE * poses[1].score_mm
 
 
-def _select_distinct(poses: Sequence[Pose], limit: int, same_turn: float) -> list[Pose]:
+def _select_distinct(poses: Sequence[PoseCandidate], limit: int, same_turn: float) -> list[PoseCandidate]:
     """Return up to `limit` of `poses`, without rotations close to an earlier one."""
     R = np.stack([pose.T_scan_model.rotation for pose in poses])
     return [poses[i] for i in _distinct_rows(R, np.zeros((len(R), 3)), limit, same_turn, math.inf)]

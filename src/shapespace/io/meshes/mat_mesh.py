@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.io.parsing import CUT_SHORT, damage_error, mesh_of
-from shapespace.io.sandbox import HDF5_SIGNATURE, SandboxError, Tree, read_matlab_sandboxed
+from shapespace.io.sandbox import HDF5_SIGNATURE, FileContent, SandboxError, read_matlab_sandboxed
 from shapespace.types import Mesh
 
 _HDF5_AT = 512  # MAT-file 7.3: HDF5 begins after a user block of 512 bytes
@@ -52,7 +52,7 @@ def read_mat_mesh(data: bytes, path: Path) -> Mesh:
         return mesh_of(points, corners.astype(np.int64) - 1, path)
 
 
-def _mesh(tree: Tree) -> tuple[npt.NDArray[Any], npt.NDArray[Any]] | None:
+def _mesh(tree: FileContent) -> tuple[npt.NDArray[Any], npt.NDArray[Any]] | None:
     """Return the vertices and faces of one structure, if there is one."""
     places: dict[str, dict[str, npt.NDArray[Any]]] = {}
     arrays: Mapping[str, npt.NDArray[Any]] = tree.arrays

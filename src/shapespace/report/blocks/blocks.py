@@ -53,7 +53,7 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Column:
+class Head:
     """One column of a table: its head, and whether it contains numbers or text."""
 
     head: str
@@ -75,7 +75,7 @@ class Table:
     MOST_OPEN = 14
     """Rows beyond which a table scrolls within itself."""
 
-    columns: Sequence[Column]
+    columns: Sequence[Head]
     rows: Sequence[Sequence[Cell]]
     caption: str
     sortable: bool = False
@@ -284,7 +284,7 @@ def length(value: float) -> Cell:
     return Cell(mm(value).removesuffix(" mm"), value)
 
 
-def table_of(items: Sequence[_Item], columns: Sequence[tuple[Column, Callable[[_Item], Cell]]], caption: str) -> Table:
+def table_of(items: Sequence[_Item], columns: Sequence[tuple[Head, Callable[[_Item], Cell]]], caption: str) -> Table:
     """Return a sortable table with one row per item, whose cells the columns make."""
     rows = [[make(item) for _, make in columns] for item in items]
     return Table([column for column, _ in columns], rows, caption, sortable=len(rows) > 1)
@@ -292,7 +292,7 @@ def table_of(items: Sequence[_Item], columns: Sequence[tuple[Column, Callable[[_
 
 def text_table(heads: Sequence[str], rows: Sequence[Sequence[str]], caption: str) -> Table:
     """Return a table of texts that may be long."""
-    return Table([Column(head) for head in heads], [[Cell(text) for text in row] for row in rows], caption, stack=True)
+    return Table([Head(head) for head in heads], [[Cell(text) for text in row] for row in rows], caption, stack=True)
 
 
 def facts_of(values: Mapping[str, object], caption: str) -> Facts:

@@ -21,11 +21,11 @@ from shapespace.report import figures
 from shapespace.report.blocks.blocks import (
     Block,
     Cell,
-    Column,
     Facts,
     Figure,
     Folded,
     Group,
+    Head,
     Notes,
     Table,
     Text,
@@ -538,11 +538,11 @@ def fits_table(fits: Sequence[SavedFit], places: Mapping[str, str], *, caption: 
         places: anchors in the page by the names of the fits.
         caption: caption of the table.
     """
-    columns: list[tuple[Column, _Make]] = [
-        (Column("Scan"), lambda fit: Cell(fit.name, anchor=places.get(fit.name))),
-        (Column("Label"), lambda fit: Cell(fit.label if fit.label != fit.name else "")),
-        (Column("Status"), lambda fit: status(fit.status)),
-        *((Column(head, "number"), make) for head, make in _NUMBERS),
+    columns: list[tuple[Head, _Make]] = [
+        (Head("Scan"), lambda fit: Cell(fit.name, anchor=places.get(fit.name))),
+        (Head("Label"), lambda fit: Cell(fit.label if fit.label != fit.name else "")),
+        (Head("Status"), lambda fit: status(fit.status)),
+        *((Head(head, "number"), make) for head, make in _NUMBERS),
     ]
     nonempty = [
         (column, cells)
@@ -631,7 +631,7 @@ def score_tables(scores: Mapping[str, Any], *, many: str, single: str) -> list[B
         names = list(dict.fromkeys(name for value in by_thing.values() for name in value))
         out.append(
             Table(
-                [Column("Score"), *(Column(name, "number") for name in names)],
+                [Head("Score"), *(Head(name, "number") for name in names)],
                 [row(key, [value.get(name) for name in names]) for key, value in by_thing.items()],
                 many,
             )
@@ -643,7 +643,7 @@ def score_tables(scores: Mapping[str, Any], *, many: str, single: str) -> list[B
         for name, single_value in (_mapping(value) or {key: value}).items()
     ]
     if rest:
-        out.append(Table([Column("Score"), Column("Value", "number")], rest, single))
+        out.append(Table([Head("Score"), Head("Value", "number")], rest, single))
     return out or [Text("There are no scores.")]
 
 

@@ -58,7 +58,7 @@ class PlacedSurface:
 
 
 @dataclass(frozen=True, eq=False)
-class Population:
+class SurfacePopulation:
     """Summary of all readable surfaces.
 
     Args:
@@ -104,7 +104,7 @@ class Corresponded:
         self.records = {record.name: record for record in map(self._record, self._record_files()) if record is not None}
         self.turn = np.eye(3)
         self._is_upright = False
-        self._population: Population | None = None
+        self._population: SurfacePopulation | None = None
 
     @property
     def root(self) -> Path:
@@ -209,7 +209,7 @@ class Corresponded:
     def _turn_by(self, turns: Sequence[FloatArray]) -> None:
         self.turn, self._is_upright = upright(self._mean, turns), True
 
-    def population(self, on_scan: Callable[[str], None] | None = None) -> Population:
+    def population(self, on_scan: Callable[[str], None] | None = None) -> SurfacePopulation:
         """Summarise all surfaces, and bring the mean shape upright; each surface is read once.
 
         Args:
@@ -239,7 +239,7 @@ class Corresponded:
                     turns.append(placed.T_scan_mean.rotation)
             if not self._is_upright:
                 self._turn_by(turns)
-            self._population = Population(
+            self._population = SurfacePopulation(
                 tuple(names),
                 counts,
                 np.array(sizes),

@@ -100,7 +100,7 @@ class ListedColumn:
 
 
 @dataclass(frozen=True)
-class Group:
+class UnusualGroup:
     """Difference between the fits of one level, or one interval, and all fits.
 
     Args:
@@ -231,7 +231,7 @@ class Population:
             for k in rows[np.argsort(np.where(np.isfinite(error), -error, 0.0), kind="stable")[:max_count]]
         ]
 
-    def compared(self, column: ListedColumn) -> Iterator[Group]:
+    def compared(self, column: ListedColumn) -> Iterator[UnusualGroup]:
         """Yield the difference between the fits of each level, or interval, of a column and all fits."""
         trusted, errors = self.trusted, self.measures["expected_error_mm"]
         known = errors[trusted & np.isfinite(errors)]
@@ -263,7 +263,7 @@ class Population:
                 shift = float(shifts[mode - 1])
                 if abs(shift) > max(_SIGNS / np.sqrt(len(group_errors)), _LEAST_SHIFT):
                     out.append(f"z{mode} is {'higher' if shift > 0 else 'lower'} by {abs(shift):.2f} on average")
-            yield Group(
+            yield UnusualGroup(
                 name=name,
                 count=count,
                 untrusted=untrusted,

@@ -17,11 +17,11 @@ from shapespace.report.blocks.blocks import (
     Block,
     Card,
     Cell,
-    Column,
     Command,
     Facts,
     Folded,
     Gallery,
+    Head,
     Image,
     Notice,
     StripKey,
@@ -456,23 +456,23 @@ class CorrespondencePage:
 
     def numbers(self) -> list[Block]:
         """Return the table of all scans."""
-        columns: list[tuple[Column, _Make]] = [
-            (Column("Scan"), lambda r: Cell(r.name, anchor=self._cards.get(r.name))),
-            (Column("Status"), lambda r: self.status(r)),
-            (Column("Mean distance", "number"), lambda r: _cell(known(r.distance_mean))),
-            (Column("95 % within", "number"), lambda r: _cell(known(r.distance_p95))),
-            (Column("99 % within", "number"), lambda r: _cell(known(r.distance_p99))),
-            (Column("Farthest", "number"), lambda r: _cell(known(r.distance_max))),
-            (Column("Mean, % of size", "number"), lambda r: _cell(100 * self.share(r, "mean"))),
-            (Column("99 %, % of size", "number"), lambda r: _cell(100 * self.share(r, "p99"))),
-            (Column("Vertices shown, %", "number"), lambda r: number(100 * known(r.seen_share), 1)),
-            (Column("Scan reached, %", "number"), lambda r: number(100 * known(r.covered_share), 1)),
-            (Column("Area covered, %", "number"), lambda r: number(100 * known(r.area_share), 1)),
-            (Column("Folded, %", "number"), lambda r: _cell(100 * known(r.folded_share))),
-            (Column("Area change, times", "number"), lambda r: number(known(r.area_factor), 2)),
-            (Column("Size, relative to usual", "number"), lambda r: number(known(r.scale), 3)),
-            (Column("Moved last, % of size", "number"), lambda r: _cell(100 * (r.moved_share or [nan])[-1])),
-            (Column("CPU seconds", "number"), lambda r: number(sum(r.cpu_s) if r.cpu_s else nan, 1)),
+        columns: list[tuple[Head, _Make]] = [
+            (Head("Scan"), lambda r: Cell(r.name, anchor=self._cards.get(r.name))),
+            (Head("Status"), lambda r: self.status(r)),
+            (Head("Mean distance", "number"), lambda r: _cell(known(r.distance_mean))),
+            (Head("95 % within", "number"), lambda r: _cell(known(r.distance_p95))),
+            (Head("99 % within", "number"), lambda r: _cell(known(r.distance_p99))),
+            (Head("Farthest", "number"), lambda r: _cell(known(r.distance_max))),
+            (Head("Mean, % of size", "number"), lambda r: _cell(100 * self.share(r, "mean"))),
+            (Head("99 %, % of size", "number"), lambda r: _cell(100 * self.share(r, "p99"))),
+            (Head("Vertices shown, %", "number"), lambda r: number(100 * known(r.seen_share), 1)),
+            (Head("Scan reached, %", "number"), lambda r: number(100 * known(r.covered_share), 1)),
+            (Head("Area covered, %", "number"), lambda r: number(100 * known(r.area_share), 1)),
+            (Head("Folded, %", "number"), lambda r: _cell(100 * known(r.folded_share))),
+            (Head("Area change, times", "number"), lambda r: number(known(r.area_factor), 2)),
+            (Head("Size, relative to usual", "number"), lambda r: number(known(r.scale), 3)),
+            (Head("Moved last, % of size", "number"), lambda r: _cell(100 * (r.moved_share or [nan])[-1])),
+            (Head("CPU seconds", "number"), lambda r: number(sum(r.cpu_s) if r.cpu_s else nan, 1)),
         ]
         records = [*self.out, *self.ordered]
         units = "The scans are in different units: compare distances in % of the size."
@@ -529,9 +529,9 @@ class CorrespondencePage:
             figure,
             Table(
                 [
-                    Column("Round"),
+                    Head("Round"),
                     *(
-                        Column(head, "number")
+                        Head(head, "number")
                         for head in [
                             "Moved (RMS), % of size",
                             "CPU seconds, all scans",

@@ -19,12 +19,12 @@ from shapespace.report.blocks.blocks import (
     Block,
     Card,
     Cell,
-    Column,
     Command,
     Facts,
     Figure,
     Folded,
     Gallery,
+    Head,
     Image,
     Notice,
     StripKey,
@@ -746,7 +746,11 @@ class ManyPage(FolderPage):
             return []
         out: list[Block] = [
             Table(
-                [Column("Status"), Column("Reason, without its names and numbers"), Column("Fits", "number")],
+                [
+                    Head("Status"),
+                    Head("Reason, without its names and numbers"),
+                    Head("Fits", "number"),
+                ],
                 [[status(kind), Cell(printable(reason)), number(count, 0)] for (kind, reason), count in most],
                 "Why fits are not trusted, the most frequent reasons first",
             )
@@ -824,8 +828,8 @@ class ManyPage(FolderPage):
         if not rows:
             return [Text("No fit has coefficients.", "soft")]
         heads = [
-            Column("Scan"), Column("Status"), Column("RMS of z", "number"), Column("Largest", "number"),
-            Column("Expected vertex error", "number"), *(Column(column.name) for column in listed_in),
+            Head("Scan"), Head("Status"), Head("RMS of z", "number"), Head("Largest", "number"),
+            Head("Expected vertex error", "number"), *(Head(column.name) for column in listed_in),
         ]  # fmt: skip
         return [
             Table(
@@ -888,9 +892,9 @@ class ManyPage(FolderPage):
 
     def _compared(self, column: ListedColumn) -> Table:
         heads = [
-            Column(column.name), Column("Fits", "number"), Column("Not trusted, %", "number"),
-            Column("Expected error, median", "number"), Column("Compared with all", "number"),
-            Column("Coefficient that differs most", "number"), Column("Stands out"),
+            Head(column.name), Head("Fits", "number"), Head("Not trusted, %", "number"),
+            Head("Expected error, median", "number"), Head("Compared with all", "number"),
+            Head("Coefficient that differs most", "number"), Head("Stands out"),
         ]  # fmt: skip
         rows = [
             [

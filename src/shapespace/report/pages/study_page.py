@@ -20,12 +20,12 @@ from shapespace.report.blocks import sections
 from shapespace.report.blocks.blocks import (
     Block,
     Cell,
-    Column,
     Command,
     Facts,
     Figure,
     Folded,
     Group,
+    Head,
     Notice,
     Table,
     Text,
@@ -181,7 +181,7 @@ class StudyParts:
                 f"a row of a table has another number of cells than its {len(part.columns)} columns"
             )
         heads = [
-            Column(
+            Head(
                 f"{column.name} (mm)"
                 if column.kind == "mm" and "mm" not in column.name.strip("()").split()
                 else column.name,
@@ -212,7 +212,7 @@ class StudyParts:
         )
         alt = f"Confusion matrix of {counted(len(classes), 'class', 'classes')}; right answers: {listed(right, 40)}"
         table = Table(
-            [Column("True class"), *(Column(f"predicted {name}", "number") for name in classes)],
+            [Head("True class"), *(Head(f"predicted {name}", "number") for name in classes)],
             [
                 list(map(Cell, row))
                 for row in [
@@ -668,7 +668,7 @@ class _Study:
             ]
             for target in targets[:MOST_ROWS]
         ]
-        columns = [Column(head) for head in ("What", "Target", "Reached", "Verdict", "Note")]
+        columns = [Head(head) for head in ("What", "Target", "Reached", "Verdict", "Note")]
         shown_columns = 5 if any(target.note for target in targets) else 4
         return Table(columns[:shown_columns], [row[:shown_columns] for row in rows], f"{caption}.", stack=True)
 

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import eigh
 from scipy.spatial.distance import cdist
 
-from shapespace.cohort.cohort import Cohort, Fitted
+from shapespace.cohort.cohort import Cohort, FitDiagnostics
 from shapespace.errors import InputError
 from shapespace.lazy import require_package
 from shapespace.reprs import short_repr
@@ -114,7 +114,7 @@ def samples_of(
     return Samples(read_only(x), np.zeros_like(x), mm, tuple(subjects), vertices)
 
 
-def _identity_of_fits(fitted: Fitted) -> tuple[FloatArray, FloatArray]:
+def _identity_of_fits(fitted: FitDiagnostics) -> tuple[FloatArray, FloatArray]:
     """Return the coefficients of identity (N, K) and the variances of their errors."""
     stddev = fitted.model.stddev[: fitted.b.shape[1]]
     z, variance = fitted.z, (fitted.b_stddev / stddev) ** 2

@@ -20,7 +20,7 @@ from shapespace.viewer.corresponding_surfaces import Surfaces
 from shapespace.viewer.guard import refusal
 from shapespace.viewer.model_view import ModelView
 from shapespace.viewer.server import model_app, surfaces_app
-from shapespace.viewer.uploaded_scans import FOLDER_PREFIX, Limits, Scans
+from shapespace.viewer.uploaded_scans import FOLDER_PREFIX, Scans, UploadLimits
 
 REPORT, REPORT_PAGE = "report.html", "report"
 _MOST_OPEN = 6  # pages whose data are in memory at a time
@@ -105,7 +105,7 @@ class Views:
             return surfaces_app(Surfaces(path))
         view = ModelView.open(path)
         root = Path(stack.enter_context(TemporaryDirectory(prefix=FOLDER_PREFIX, ignore_cleanup_errors=True)))
-        scans = Scans(root, view.model, view.model_name, Limits(upload_bytes=self._upload_bytes))
+        scans = Scans(root, view.model, view.model_name, UploadLimits(upload_bytes=self._upload_bytes))
         stack.callback(scans.close)
         return model_app(view, scans)
 
