@@ -142,7 +142,8 @@ def test_landmarks_in_files_named_as_the_scans_go_on_into_the_model(run: Run, ra
     outcome = run("correspond", *scans, "-o", tmp_path / "same", "--landmarks", tmp_path / "marks", *QUICK)
     assert outcome.code == 0
     assert (
-        "blob2.ply goes without landmarks" in outcome.err and "belong to no scan that is given: nobody" in outcome.err
+        "blob2.ply is used without landmarks" in outcome.err
+        and "belong to no scan that is given: nobody" in outcome.err
     )
     record = json.loads((tmp_path / "same" / "blob0.correspond.json").read_text("utf-8"))
     assert 0 <= record["landmark_rms"] < 15

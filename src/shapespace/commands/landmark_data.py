@@ -135,7 +135,7 @@ def _duplicates(raw: LandmarkConfigurations) -> list[str]:
             findings.append(f"{name} has the same coordinates as {other}; remove one of the specimens.")
         place: dict[tuple[float, ...], str] = {}
         for label, point in zip(raw.landmarks, points.tolist(), strict=True):
-            # Missing landmarks differ, since not-a-number does not equal itself.
+            # Missing landmarks differ, since NaN does not equal itself.
             before = place.setdefault(tuple(point), label)
             together[before, label] += before != label
     for (earlier, later), count in together.most_common():

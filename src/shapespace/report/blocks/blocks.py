@@ -36,7 +36,7 @@ class Cell:
 
     Args:
         text: text of the cell.
-        value: the number that a table sorts it by; None sorts by the text, not-a-number comes last.
+        value: the number that a table sorts it by; None sorts by the text, NaN comes last.
         status: name of the status, which sets the colour; empty for none.
         anchor: place in the page that the cell links to, or None.
     """

@@ -279,7 +279,7 @@ def checkerboard_figure(
 
     Args:
         mean: the mean shape, upright.
-        surfaces: (V, 3) each, moved onto the mean shape; not-a-number where missing.
+        surfaces: (V, 3) each, moved onto the mean shape; NaN where missing.
         labels: one label per surface.
         yaw_deg: angle of the camera from the front, degrees.
         title: above the figure.

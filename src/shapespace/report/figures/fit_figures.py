@@ -80,7 +80,7 @@ _TOWERS = 2.0
 """Times its neighbour, and percent, beyond which the first bar of a histogram needs a word."""
 _NEAREST_MM, _FARTHEST_MM = 0.01, 300.0  # mm, limits of a logarithmic axis
 _TEXT_ROOM = 1.42
-"""How much farther than the tallest bar a half of a histogram reaches, for the line of text above it."""
+"""Height of half a histogram relative to its tallest bar, with room for the line of text above it."""
 
 
 def stages_figure(fit: StagedFit, *, title: str = "") -> Figure:

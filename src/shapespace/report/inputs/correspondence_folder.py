@@ -42,7 +42,7 @@ class PlacedSurface:
     """One surface in the frame of the pictures.
 
     Args:
-        vertices: (V, 3) in the frame of `Corresponded.mean`, size divided out; not-a-number where missing.
+        vertices: (V, 3) in the frame of `Corresponded.mean`, size divided out; NaN where missing.
         T_scan_mean: transformation from that frame to the scan's own.
         position_std: (V,) `Mesh.position_std` as a share of the object's size; None if the file has none.
     """

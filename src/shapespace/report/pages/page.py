@@ -65,7 +65,7 @@ class Page:
 
     @property
     def left(self) -> int:
-        """How many bytes may still be embedded."""
+        """Number of bytes that may still be embedded."""
         return LARGEST_REPORT_BYTES - self.spent
 
     def once(self, key: object, load: Callable[[], _T]) -> _T:

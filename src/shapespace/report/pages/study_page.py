@@ -460,7 +460,7 @@ SECTION_BYTES = 1_500_000
 """Bytes of a report of fits that are reserved for this section."""
 
 MOST_ANALYSES = 12
-"""How many analyses a report of fits shows."""
+"""Largest number of analyses in a report of fits."""
 
 # parts of a study, and characters of a damaged value, that a page shows: bounds its length
 _MOST_PARTS, _MOST_TEXT = 120, 400

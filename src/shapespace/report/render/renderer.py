@@ -27,7 +27,7 @@ Image: TypeAlias = npt.NDArray[np.uint8]
 _Single: TypeAlias = npt.NDArray[np.float32]
 
 SQUARE_COLOURS = 5
-"""How many colours the squares of a checkerboard take in turn."""
+"""Number of colours that the squares of a checkerboard take in turn."""
 
 _LARGEST_SIDE = 8192  # pixels; limit on memory
 _SUPERSAMPLE = 2  # samples per pixel and axis
@@ -495,7 +495,7 @@ def nearest_triangles(
     first one stays.
 
     Args:
-        screen: (V, 2) pixels, y down; not-a-number drops the triangles of a vertex.
+        screen: (V, 2) pixels, y down; NaN drops the triangles of a vertex.
         depth: (V,) linear across a triangle on the screen, growing away from the eye.
         faces: (F, 3).
         width: width of the picture, pixels.
@@ -636,7 +636,7 @@ def nearest_balls(
     """Fill in for each pixel, row by row, the ball whose surface is nearest at its centre (-1 for none), and its depth.
 
     Args:
-        screen: (V, 2) pixels, y down; not-a-number drops a ball.
+        screen: (V, 2) pixels, y down; NaN drops a ball.
         depth_mm: (V,) depth of the balls' centres.
         radius: radius of the balls, pixels.
         rise_mm: distance of the front of a ball from its centre, mm.

@@ -272,7 +272,7 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: i
 
     Arrays: `scan` (S, 3) mm and `scan_faces`; `faces` of the model; by stage `surface_STAGE` (V, 3) mm,
     `model_to_scan_STAGE` (V,) and `scan_to_model_STAGE` (S,) mm, signed where the fact `signed` is true, lengths where
-    the scan is a point cloud, not-a-number where unknown; `beyond_model_STAGE` and
+    the scan is a point cloud, NaN where unknown; `beyond_model_STAGE` and
     `beyond_scan_STAGE` (101,), the shares of all vertices farther than 0, 0.1, ... 10 mm; `regions` (V,) codes, where
     the stages were saved;
     of a scan with colours `scan_colours` (S, 3), `colours_final` and `colours_dense` (V, 3) uint8;
