@@ -158,7 +158,7 @@ def test_raw_coordinates_that_fit_both_are_read_with_the_dimensions(write) -> No
         name = write(f"{count}.txt", raw_table(count))
         with pytest.raises(FileFormatError, match=said):
             read_configurations(name, dimensions=dimensions)
-    with pytest.raises(InputError, match="has landmarks in 2-D; leave --dimensions 3 out"):
+    with pytest.raises(InputError, match="has landmarks in 2-D; omit --dimensions 3"):
         read_configurations(write("a.tps", "LM=2\n1 2\n3 4\n"), dimensions=3)
 
 

@@ -239,7 +239,7 @@ def test_a_folder_has_a_file_for_each_specimen(tmp_path: Path) -> None:
     write_landmarks(tmp_path / "c.fcsv", {"nose": marks["nose"]})
     with pytest.raises(
         FileError,
-        match=r"c\.fcsv: it has 1 landmarks in 3-D and a\.landmarks\.fcsv has 2 landmarks in 3-D \(chin in one of",
+        match=r"c\.fcsv: it has 1 landmarks in 3-D and a\.landmarks\.fcsv has 2 landmarks in 3-D \(chin in only one",
     ):
         read_configurations(tmp_path)
 
