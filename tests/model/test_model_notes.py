@@ -65,7 +65,7 @@ def test_incomplete_shapes_and_b_splines_follow_the_same_rule(faces_in_memory: l
     lacking = f"1 of {6 * len(vertices)} vertices are missing (0.1 %), in 1 of 6 meshes."
     assert build_model(holed, BuildConfig(modes=30)).notes == (lacking, FEWER)
     spline = build_model(faces_in_memory, BuildConfig(modes=30, representation="bspline", control_points=(8, 8)))
-    assert spline.n_modes == len(faces_in_memory) - 1 and "so the model has 3 and not the 30" in spline.notes[0]
+    assert spline.n_modes == len(faces_in_memory) - 1 and "has 3 and not the requested 30" in spline.notes[0]
 
 
 @pytest.fixture(scope="module")
