@@ -9,7 +9,7 @@ class ShapespaceError(Exception):
         ...     ss.build_model(meshes[:1])
         ... except ss.ShapespaceError as error:
         ...     print(error)
-        A shape model needs at least two meshes, not 1; with one there is nothing that varies.
+        A shape model needs at least two meshes, not 1; one mesh has no variation.
     """
 
 

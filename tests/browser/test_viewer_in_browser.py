@@ -338,7 +338,7 @@ def test_coefficients_of_another_model_are_refused(open_tab, address: str, world
     fewer = table(lambda name: name == "scan" or (name[0] == "z" and name[1:].isdigit() and int(name[1:]) <= K - 2))
     add_csv(tab, tmp_path / "fewer.csv", fewer)
     message.wait_for(state="visible")
-    assert f"fewer.csv holds {K - 2} coefficients and model.h5 has {K}" in message.inner_text()
+    assert f"fewer.csv contains {K - 2} coefficients and model.h5 has {K}" in message.inner_text()
     holes = table(lambda name: name == "scan" or (name[0] == "z" and name[1:].isdigit() and name != "z3"))
     add_csv(tab, tmp_path / "holes.csv", holes)
     tab.until("document.querySelector('[data-testid=message]').innerText.includes('holes.csv')")

@@ -61,7 +61,7 @@ def test_blendshapes_alone_are_no_model(tmp_path: Path) -> None:
 def test_expressions_of_another_model_are_refused(model: ShapeModel, tmp_path: Path) -> None:
     shape, out = tmp_path / "shape.bin", tmp_path / "out.h5"
     other = blendshapes(tmp_path / "other.bin", smiles(20), ["a", "b"])
-    with pytest.raises(ModelFileError, match="is of 20 vertices"):
+    with pytest.raises(ModelFileError, match="has 20 vertices"):
         convert(shape, out, expressions=other)
     with pytest.raises(ModelFileError, match="no blendshapes of eos"):
         convert(shape, out, expressions=shape)

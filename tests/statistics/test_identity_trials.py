@@ -150,7 +150,7 @@ def test_scans_of_nobody_are_refused_or_left_out():
         verify(shapes, FEW)
     found = verify(shapes, replace(FEW, drop_missing=True))
     assert len(found.trial.cohort) == 35
-    assert any("left out" in note for note in analysis_report(found).notes)
+    assert any("excluded" in note for note in analysis_report(found).notes)
 
 
 @pytest.fixture(scope="module")

@@ -40,7 +40,7 @@ Surface: TypeAlias = MeshLike | FitResult | FitRecord | Mapping[str, Any]
 """A mesh or input of `as_mesh`, the result of a fit, or its record, typed or as the content of NAME.fit.json."""
 Surfaces: TypeAlias = Sequence[Surface] | FloatArray | str | PathLike[str]
 """Several surfaces; (n, V, 3) vertices; or the folder of meshes in correspondence."""
-_COUNT = re.compile(r"\d+ (of \d+ )?(vertex is|vertices are) (missing|taken)")  # sentences on missing vertices
+_COUNT = re.compile(r"\d+ (of \d+ )?(vertex is|vertices are) (missing|removed)")  # sentences on missing vertices
 
 
 class ShapeSpace(TransformerMixin, BaseEstimator):
@@ -139,7 +139,7 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
         for note in [
             note
             for note in model.notes
-            if not re.match(r"\d+ (of \d+ )?(vertex is|vertices are) (missing|taken)", note)
+            if not re.match(r"\d+ (of \d+ )?(vertex is|vertices are) (missing|removed)", note)
         ]:
             warnings.warn(note, stacklevel=3)
         return model
