@@ -178,9 +178,9 @@ def automatic(maker: Maker, ceiling: Mapping[str, float]) -> dict[str, float]:
         parts.confusion("Two highest intensities", maker.labels[maker.high].tolist(),
                         np.asarray(found.predicted)[maker.high].tolist(), maker.classes, "The same."),
         parts.per_class("Each expression, all intensities", maker.labels.tolist(), found.predicted, maker.classes),
-        parts.calibration("Whether the probabilities come true", maker.labels.tolist(), found.probabilities,
+        parts.calibration("Calibration of the probabilities", maker.labels.tolist(), found.probabilities,
                           found.classes),
-        parts.learning_curve("How many people it takes", folds, _CURVE, ceiling=ceiling["all"]),
+        parts.learning_curve("Accuracy by number of training people", folds, _CURVE, ceiling=ceiling["all"]),
     ]  # fmt: skip
     return best
 

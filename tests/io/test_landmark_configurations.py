@@ -235,7 +235,7 @@ def test_a_folder_has_a_file_for_each_specimen(tmp_path: Path) -> None:
     found = read_configurations(tmp_path)
     assert found.names == ("a", "b") and found.landmarks == ("nose", "chin") and found.unit == "mm"
     np.testing.assert_array_equal(found.points[0], found.points[1])
-    assert found.notes == ("1 files without .fcsv are skipped (old.pp).",)
+    assert found.notes == ("Files without .fcsv are skipped: old.pp.",)
     write_landmarks(tmp_path / "c.fcsv", {"nose": marks["nose"]})
     with pytest.raises(
         FileError,

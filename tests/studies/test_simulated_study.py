@@ -123,7 +123,7 @@ def test_every_table_is_made_and_the_report_shows_it(done: Path, tmp_path: Path)
     titles = [part["title"] for part in made["parts"]]
     for wanted in (
         "Six approaches, one classifier, the same folds", "Classifiers on the additive model's expressions",
-        "All four intensities", "Whether the probabilities come true", "How many people it takes",
+        "All four intensities", "Calibration of the probabilities", "Accuracy by number of training people",
         "Modes that carry the decision", "Parts of the face that carry the decision",
         "Whose face it is, from expressive scans", "How far identity and expression are apart",
         "Trained on ICT-FaceKit, tested on the bundled generator", "One person's expression put on others",

@@ -264,7 +264,7 @@ def model_facts(model: ShapeModel) -> dict[str, Any]:
         "units": "mm",
         "extent_mm": np.ptp(model.mean_vertices, axis=0).tolist(),
         "variance_held": float(model.cumulative_variance[-1]),
-        "variance_of": "people left out" if model.held_out else "training shapes",
+        "variance_of": "held-out people" if model.held_out else "training shapes",
         "modes_for_variance": {share: modes for share, modes in needed.items() if modes is not None},
         "stddev_mm": model.stddev.tolist(),
         **(

@@ -54,7 +54,7 @@ def read_gltf_model(path: Path) -> LinearModel:
                 f"{merged} vertices that are equal to another in position and displacements, as at seams, are merged."
             )
     if morphs.n_others:
-        notes.append(f"{morphs.n_others} more meshes of the scene are omitted.")
+        notes.append(f"Other meshes of the scene are omitted ({morphs.n_others}).")
     if any(morphs.weights):
         notes.append("Its weights are not zero; the mean is the shape without them.")
     if not facts:

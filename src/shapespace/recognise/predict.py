@@ -136,11 +136,7 @@ class ShapeSpace(TransformerMixin, BaseEstimator):
             seed=self.seed,
         )
         # Counts of missing vertices are no warnings: each fold of a cross-validation would repeat them.
-        for note in [
-            note
-            for note in model.notes
-            if not re.match(r"\d+ (of \d+ )?(vertex is|vertices are) (missing|removed)", note)
-        ]:
+        for note in [note for note in model.notes if not _COUNT.match(note)]:
             warnings.warn(note, stacklevel=3)
         return model
 

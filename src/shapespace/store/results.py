@@ -97,12 +97,10 @@ class ResultStore:
                     if str(error) not in self.problems:
                         self.problems.append(str(error))
                     continue
-                for row, (name, identity, status, content_hash, *flags) in enumerate(
-                    zip(*columns.values(), strict=True)
-                ):
+                for row, (name, identity, status, position, *flags) in enumerate(zip(*columns.values(), strict=True)):
                     index.pop(name, None)
                     index[name] = StoredFit(
-                        number, row, content_hash, identity or "", status, *(flag is True for flag in flags)
+                        number, row, position, identity or "", status, *(flag is True for flag in flags)
                     )
             self._index = index
         return self._index

@@ -253,7 +253,7 @@ def _read_folder(folder: Path, curve_points: int | None) -> LandmarkConfiguratio
     # because they mark missing landmarks.
     ending = max(files, key=lambda end: (end not in _LINES, len(files[end]), end == ".mrk.json"))
     others = [file.name for other, listed in files.items() if other != ending for file in listed]
-    notes = [f"{len(others)} files without {ending} are skipped ({first_names(others)})."] if others else []
+    notes = [f"Files without {ending} are skipped: {first_names(others)}."] if others else []
     parts = _join_files(
         [_read_file(file, None) if ending in _MANY else _read_specimen(file, ending) for file in files[ending]]
     )

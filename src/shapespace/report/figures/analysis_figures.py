@@ -401,14 +401,14 @@ def nearness_figure(distances: FloatArray, *, title: str = "") -> Figure:
 
 
 def movement_figure(
-    rounds: Sequence[float], scans: Sequence[Sequence[float]], settled_mm: float, *, title: str = ""
+    rounds: Sequence[float], scans: Sequence[Sequence[float]], settled_share: float, *, title: str = ""
 ) -> Figure:
     """Draw by how much vertices moved in each round: all together, and each scan.
 
     Args:
         rounds: RMS of each round, shares of the size.
         scans: RMS of each round of each scan; scans that missed a round are omitted.
-        settled_mm: movement below which the rounds end, share of the size.
+        settled_share: movement below which the rounds end, share of the size.
         title: above the figure.
 
     Raises:
@@ -432,7 +432,7 @@ def movement_figure(
     axes.plot(
         round_numbers, np.maximum(100 * np.array(rounds), 1e-3), color=INK, lw=2.6, marker="o", label="all together"
     )
-    axes.axhline(100 * settled_mm, color=_LINES[2], lw=1.2, ls="--", label="settled below")
+    axes.axhline(100 * settled_share, color=_LINES[2], lw=1.2, ls="--", label="settled below")
     axes.set(xlabel="round", ylabel="moved (RMS), % of the size", yscale="log")
     plain_decades(axes.yaxis)
     number_axis(axes, len(rounds), room=0.3)
