@@ -447,7 +447,7 @@ class SurfaceReview(Struct, frozen=True, kw_only=True):
 
     @staticmethod
     def of(codes: Iterable[Sequence[ReviewCode]]) -> SurfaceReview:
-        """Count surfaces by the `codes` of their reasons, which are empty for a surface that needs no review."""
+        """Count surfaces from the codes of the reasons of each; a surface that needs no review has none."""
         every = [set(own) for own in codes]
         counts: Counter[ReviewCode] = Counter(code for own in every for code in own)
         return SurfaceReview(surfaces=len(every), needs_review=sum(map(bool, every)), reasons=_sort_counts(counts))
@@ -757,7 +757,7 @@ class LearningCurvePart(Part, frozen=True, kw_only=True, tag="learning_curve"):
 
 
 class Series(Struct, frozen=True, kw_only=True):
-    """One line of a curve, optionally with a band; `points` are dots without a line.
+    """One line of a curve, optionally with a band; drawn as dots without a line if `points` is true.
 
     Series with the same `group`, a number from 0, have the same colour and marker.
     """
@@ -957,7 +957,7 @@ class Recognition(Struct, frozen=True, kw_only=True):
 
 
 class SampleSize(Struct, frozen=True, kw_only=True):
-    """Number of subjects and of shapes in a class of one variable, or in a combination of classes of several."""
+    """Number of subjects and shapes in a class of a variable, or in a combination of classes of several variables."""
 
     variables: tuple[str, ...]
     classes: tuple[str, ...]

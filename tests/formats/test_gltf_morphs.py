@@ -171,7 +171,7 @@ def test_seams_are_joined_and_the_shape_at_rest_is_the_mean(model: ShapeModel, t
     assert (
         "are merged" in said
         and "weights are not zero" in said
-        and "1 more" in said
+        and "omitted (1)" in said
         and "one standard deviation" in said
     )
 

@@ -59,6 +59,7 @@ def test_undo_takes_every_edit_back_and_redo_applies_it_again(project: Project) 
     states = [project.state]
     for request in (
         {"what": "add-column", "column": "sex"},
+        {"what": "add-column", "column": "age"},
         {"what": "cells", "cells": [{"id": "anna", "column": "sex", "value": "f"}]},
         {"what": "include", "ids": ["ben"], "included": False},
         {"what": "set", "ids": ["carl"], "set": "new"},
@@ -70,6 +71,7 @@ def test_undo_takes_every_edit_back_and_redo_applies_it_again(project: Project) 
         edit(project, **request)
         states.append(project.state)
     assert len({json.dumps(str(state)) for state in states}) == len(states)
+    assert states[-2].columns == ("sex", "age") and states[-1].columns == ("age",)
     for state in reversed(states[:-1]):
         project.undo(project.revision)
         assert project.state == state == Project.open(project.folder).state

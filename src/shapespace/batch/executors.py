@@ -30,7 +30,8 @@ class Executor(Protocol):
     """Does tasks."""
 
     def run(self, work: Work[T, R], tasks: Sequence[T], /) -> AbstractContextManager[Iterator[tuple[T, R]]]:
-        """Return a context whose value yields each task with its answer; leaving it early stops the running tasks.
+        """Return a context manager of an iterator over pairs of task and answer; running tasks stop if it is left
+        early.
 
         Raises:
             FitError: no workers are left, or none can start.

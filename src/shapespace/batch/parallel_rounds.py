@@ -128,7 +128,7 @@ def _key(task: RegistrationTask, shared: str) -> str:
 
 
 def _flatten(value: object, name: str) -> Iterator[tuple[str, npt.NDArray[Any]]]:
-    """Yield name and array of everything that `value` contains, for any fields, so that no field is missed."""
+    """Yield the name and the array of every item in `value`; all fields of a dataclass are included."""
     if isinstance(value, np.ndarray):
         yield name, cast(npt.NDArray[Any], value)
     elif is_dataclass(value):

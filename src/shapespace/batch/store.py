@@ -359,7 +359,9 @@ def _end_of_table(path: Path) -> bytes:
 
 
 def _to_disk(path: Path) -> None:
-    """Wait until a file, or the entries of a folder, are on the disk, because single files are removed afterwards."""
+    """Wait until a file, or the entries of a folder, are on the disk, because the single files whose results they
+    contain are removed afterwards.
+    """
     if path.is_dir() and os.name == "nt":
         return
     try:

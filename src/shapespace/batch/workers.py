@@ -257,7 +257,7 @@ def interrupts_ignored() -> Generator[None]:
 
 
 class Work(Protocol[TaskT, AnswerT]):
-    """Function of each task and its data: frozen, small, and sent to every worker.
+    """A function that is called with each task, and its data; frozen and small, because it is sent to every worker.
 
     It refers to shared data of the tasks by path or hash; `do` loads these data once in each process (`Shared`,
     `LatestValue`).

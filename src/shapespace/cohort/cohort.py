@@ -73,10 +73,11 @@ class FitDiagnostics:
         model: model of the fits.
         b: (N, K) coefficients, mm.
         b_stddev: (N, K) standard deviations of the coefficients, mm.
-        status: status of each of the N fits: `converged`, `max_iterations` and, if they are included, `doubtful`.
+        status: status of each of the N fits: `converged` or `max_iterations`, and `doubtful` if doubtful fits are
+            included.
         folder: folder of the results, as it was passed.
-        beyond_mm: (N,) RMS of the residuals that the model does not explain, mm, NaN if a fit does not state it; None
-            if there is none.
+        beyond_mm: (N,) RMS of the residuals that the model does not explain, mm; NaN for a fit that does not state it;
+            None if no values are given.
         additive: the same model, if its file separates identity and expression; None otherwise.
     """
 
@@ -689,7 +690,7 @@ def _orthonormal(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _in_basis(rows: FloatArray, coefficients: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return an orthonormal basis and coefficients equivalent to `coefficients` (N, K) of `rows` (K, D)."""
+    """Return an orthonormal basis (K, D) of the span of `rows`, and coefficients of the same vectors in it."""
     if np.abs(rows @ rows.T - np.eye(len(rows))).max() <= _ORTHONORMAL:
         return read_only(rows), read_only(coefficients)
     q, r = np.linalg.qr(rows.T)

@@ -71,7 +71,7 @@ def find_orientation(
         except InputError as error:
             raise FileFormatError(f"{path}: {error}") from error
         if any(number < 1 for link in orientation.links for number in link):
-            raise FileFormatError(f"{path}: a link has a landmark below 1; number landmarks from 1.")
+            raise FileFormatError(f"{path}: a link has a landmark number below 1; number landmarks from 1.")
     if not orientation.links:
         orientation = structs.replace(
             orientation, links=(curve_links if links is None else read_links(links, landmarks))

@@ -243,7 +243,7 @@ def _read_shapes(
     if not isinstance(data, str | PathLike):
         given = data if isinstance(data, Table) else Table.of(data)
         if not config.shapes:
-            raise InputError("A table in memory needs the place of its shapes; give it as CohortConfig(shapes=...).")
+            raise InputError("A table in memory needs the folder of its shapes; give it as CohortConfig(shapes=...).")
         data = config.shapes
     data = Path(cast("str | PathLike[str]", data))
     source = Path(config.shapes) if config.shapes else data

@@ -126,7 +126,7 @@ class BuildFilesConfig:
 
     @property
     def of_vertices(self) -> bool:
-        """Whether it is a plain model of vertices, whose meshes can be streamed."""
+        """Whether it is a model of vertices without separate expression modes; only its meshes can be streamed."""
         return self.labels is None and self.model.representation == "vertices"
 
 

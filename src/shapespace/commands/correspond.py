@@ -1,4 +1,4 @@
-"""Command `correspond`: raw scans in files to the same surfaces in correspondence, in a folder that `build` takes."""
+"""Command `correspond`: bring raw scans from files into correspondence, in a folder that `build` takes."""
 
 from __future__ import annotations
 

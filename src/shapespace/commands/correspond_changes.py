@@ -316,7 +316,7 @@ def _register_scans(
 
 
 def _registration_of_record(finished: _FinishedFolder, name: str) -> Corresponding:
-    """Return the registration of a scan that stays, from its record."""
+    """Return the registration of a scan that is kept unchanged, from its record and its surface."""
     record, surface, mean = finished.records[name], finished.surfaces[name], finished.mean.vertices
     observed = np.ones(len(mean), np.bool_) if surface.observed is None else surface.observed
     T = fit_similarity(mean[observed], surface.vertices[observed])

@@ -257,8 +257,9 @@ def judge_collection(
 
     Args:
         scans: scans of one correspondence.
-        settled: movement below which a round is the last, share of the size.
-        earlier: judged scans that these are added to; none of these changes.
+        settled: a round is the last if it moves the vertices by less than this share of the size (RMS over all
+            vertices).
+        earlier: scans that were judged before, to which `scans` are added; they are not changed and not returned.
     """
     every = [*earlier, *_add_sizes(scans, earlier)]
     measured = [(k, scan.measures) for k, scan in enumerate(every) if scan.measures is not None]

@@ -104,7 +104,8 @@ def bent_shapes(template: IntrinsicShape, scan: IntrinsicShape, seed: int) -> li
     """Return the template's vertices (V, 3) on `scan`, by the maps that change distances along the surface least.
 
     Extremities are assigned by their distances from each other; each likely assignment yields a map, which is refined
-    (ZoomOut; Melzi et al. 2019). It must not turn the surface inside out, which distinguishes left from right.
+    (ZoomOut; Melzi et al. 2019). A map that turns the surface inside out is rejected; this distinguishes left from
+    right.
 
     Args:
         template: the surface that is mapped.
@@ -184,7 +185,7 @@ def _find_extremities(embedding: FloatArray, faces: IntArray, most: int) -> IntA
 
 
 def _yield_assignments(template: IntrinsicShape, scan: IntrinsicShape) -> Iterator[IntArray]:
-    """Yield the ends of `scan` that correspond to those of the template, most similar distances first."""
+    """Yield the extremities of `scan` in the order of those of the template, likely assignments first."""
     count = min(len(template.ends), len(scan.ends))
     if count < _FEWEST_ENDS:
         return

@@ -255,7 +255,9 @@ def _compute_forces(
 
 
 def _soft_matches(points: FloatArray, queries: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Return (M, `_NEAR`) the nearest of `points` to each of `queries`, and their shares of the match."""
+    """Return the indices (M, `_NEAR`) of the `points` nearest to each of `queries`, and their weights, which sum to
+    one.
+    """
     distance, near = cKDTree(points).query(queries, k=_NEAR)
     share = 1.0 / (np.asarray(distance) ** 2 + _TOUCHING)
     return np.asarray(near, dtype=np.int32), share / share.sum(axis=1, keepdims=True)  # C3

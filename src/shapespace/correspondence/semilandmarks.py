@@ -186,7 +186,7 @@ class _MeanSurface:
                 f"{label}: no marked specimen has a landmark named {unknown[0]!r}; correct the name, or mark it."
             )
         if len(chain) < 2 or any(a == b for a, b in pairwise(chain)):
-            raise InputError(f"{label} needs two or more landmarks, neighbours different; add landmarks to it.")
+            raise InputError(f"{label} needs two or more landmarks, and none may follow itself; correct them.")
         if point_set.kind == "patch" and chain[0] != chain[-1]:
             raise InputError(
                 f"{label}: its boundary begins at {chain[0]!r} and ends at {chain[-1]!r}, so it is not closed; let it "

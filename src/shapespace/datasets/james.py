@@ -23,10 +23,11 @@ def james_available() -> bool:
 
 
 def load_james(folder: Path | None = None) -> Mesh:
-    """Return James in mm, 6,393 vertices in colours and 12,228 triangles, with landmarks `chin_0` to `mouth_19`.
+    """Return the scan James in mm: 6,393 coloured vertices, 12,228 triangles, landmarks `chin_0` to `mouth_19`.
 
     Args:
-        folder: folder with `james.obj` and `james.ljson`; None for the mirror or the cache, verified. Never downloads.
+        folder: folder with `james.obj` and `james.ljson`; None for the copy in the mirror or the cache, whose hashes
+            are verified. Nothing is downloaded.
 
     Raises:
         DataError: `folder` is None and James is not here or does not match its hash.

@@ -83,7 +83,7 @@ class Organ:
         return np.column_stack([x, wide * y + self._bent(x), wide * z])
 
     def inside(self, points: FloatArray) -> np.ndarray:
-        """Return (M,) which of `points` (M, 3) lie inside."""
+        """Return (M,) for each of `points` (M, 3) whether it lies inside the organ."""
         x = points[:, 0]
         wide = self._wide(x)
         body = np.column_stack([x, (points[:, 1] - self._bent(x)) / wide, points[:, 2] / wide])

@@ -418,7 +418,7 @@ class _Recorder:
             )
 
     def driven(self, fitted: Fitted) -> _MethodRun:
-        """Return the states together with the end of the fit."""
+        """Return the run of the method: the recorded states, and `fitted` as their end."""
         return _MethodRun(self._history, self._ended, self._phase_2_from, fitted)
 
 

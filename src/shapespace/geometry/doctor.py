@@ -169,7 +169,7 @@ class _RepairState:
         return Mesh(self.vertices, self.faces, mesh.landmarks, mesh.name, self.colours, mesh.notes)
 
     def measured(self, **values: Any) -> _RepairState:
-        """Return the state with these values in the report."""
+        """Return a copy of the state in whose report these fields have the given values."""
         return replace(self, report=replace(self.report, **values))
 
     def reported(self, level: FindingLevel, problem: str, action: str) -> _RepairState:

@@ -123,7 +123,7 @@ def _squared_stretch(vertices: FloatArray, uv: FloatArray, faces: IntArray) -> F
 
 
 def _close_holes(mesh: Mesh, faces: IntArray) -> tuple[FloatArray, IntArray, IntArray]:
-    """Return vertices and triangles with each hole closed by a fan about an additional vertex, and the rim (R,)."""
+    """Return vertices and triangles with each hole closed by a fan about a new vertex, and the open rim (R,)."""
     from scipy.sparse import coo_matrix  # slow import, not needed for models of vertices
     from scipy.sparse.csgraph import connected_components
 

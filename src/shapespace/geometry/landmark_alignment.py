@@ -332,8 +332,9 @@ def superimpose(
 def match_curves(configurations: LandmarkConfigurations, mean: FloatArray | None = None) -> LandmarkConfigurations:
     """Return landmarks whose curves have corresponding starts and directions in all specimens.
 
-    The start of a closed curve may be between its points, at the smallest Procrustes distance from the mean. A closed
-    curve in the plane has the direction of the mean, and in 3-D the direction with the smaller distance from the mean.
+    The start of a closed curve is placed where the Procrustes distance from the mean is smallest; it may lie between
+    two points of the curve. A closed curve in the plane is given the direction (clockwise or anticlockwise) of the
+    curve in the mean; in 3-D, the direction with the smaller distance from the mean.
     An open curve is reversed if this halves its distance from the mean. Curves with missing points are unchanged.
 
     Args:

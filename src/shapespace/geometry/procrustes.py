@@ -114,7 +114,7 @@ def align_shapes(shapes: FloatArray, gauge: Gauge, alignment_vertices: IntArray 
 
 
 def align_to_weighted_mean(shapes: FloatArray, weights: FloatArray, frame: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return `shapes` (N, V, 3) in the pose and size of their weighted mean, and the mean (V, 3) in those of `frame`.
+    """Return `shapes` (N, V, 3) aligned to their weighted mean, and this mean (V, 3), aligned to `frame`.
 
     Unlike in `align_in_place`, each size is fitted, and vertices may be missing.
 
@@ -134,7 +134,7 @@ def align_to_weighted_mean(shapes: FloatArray, weights: FloatArray, frame: Float
 
 
 def check_alignment(gauge: Gauge, alignment_vertices: IntArray | None, n_vertices: int) -> IntArray | slice:
-    """Return the index of the vertices for the alignment, of `n_vertices`.
+    """Return an index of the vertices for the alignment among `n_vertices` vertices; of all if none are given.
 
     Raises:
         InputError: the gauge is unknown, or the vertices for the alignment are fewer than three or do not exist.

@@ -100,8 +100,9 @@ def _igl() -> Any:
 def loop_operator(vertex_count: int, faces: npt.ArrayLike) -> tuple[Any, IntArray]:
     """Return one level of Loop subdivision as a matrix, and the refined triangles.
 
-    Old vertices keep their numbers; the midpoint of every edge follows, edges in ascending order of their two
-    vertices. Boundaries and the interior follow Loop's rules with the weights of Warren for interior vertices:
+    Old vertices keep their numbers. One new vertex for each edge follows; edges are in ascending order of their smaller
+    vertex, then of their larger vertex. Boundaries and the interior follow Loop's rules with the weights of Warren for
+    interior vertices:
     beta = 3 / (8 n), or 3 / 16 for n = 3. Vertices without a triangle stay where they are.
 
     Args:

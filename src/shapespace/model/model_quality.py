@@ -299,7 +299,7 @@ class QualityTask:
 
     Args:
         held: indices of the held-out shapes.
-        order: indices of all other shapes, of which the first ones make the smaller models.
+        order: indices of all other shapes, in random order; models of fewer shapes are built from the first ones.
         drawn: indices of the random shapes.
     """
 

@@ -39,7 +39,7 @@ class ModelRegion:
 
     @staticmethod
     def of(full: ShapeModel, region: str | tuple[int, ...]) -> ModelRegion:
-        """Return the part of `full` in `region`, one of its regions by name or vertices.
+        """Return the part of the model `full` in `region`: the name of one of its regions, or numbers of vertices.
 
         Raises:
             InputError: there is no such region, or no triangle lies in it.

@@ -59,11 +59,11 @@ class Representation(Protocol):
         ...
 
     def encode(self, vertices: FloatArray) -> FloatArray:
-        """Return (..., D) from vertices (..., V, 3), mm."""
+        """Return the vectors (..., D) that represent surfaces with the vertices (..., V, 3), mm."""
         ...
 
     def decode(self, vector: FloatArray) -> FloatArray:
-        """Return vertices (..., V, 3) from (..., D), mm."""
+        """Return the vertices (..., V, 3), mm, of the surfaces that the vectors (..., D) represent."""
         ...
 
     def directions(self, basis: FloatArray) -> FloatArray:

@@ -173,7 +173,7 @@ def pooled_line_scores(
 
 
 def _line_r2(gram: FloatArray, classes: np.ndarray) -> FloatArray:
-    """Return R2 of the line through neutral of each class, from the products (n, n) of the samples."""
+    """Return R2 of the line through neutral of each class, from the inner products (n, n) of the samples."""
     scores: list[float] = []
     for c in range(int(classes.max()) + 1):
         rows = np.flatnonzero(classes == c)

@@ -104,7 +104,7 @@ def contrast(visits: Sequence[Visit], *, rate: bool) -> FloatArray:
 
 
 def noise_factor(visits: Sequence[Visit], weights: FloatArray) -> float:
-    """Return the factor of the noise of one scan in the sum of visits by `weights` (T,), each a mean of scans."""
+    """Return the noise SD of a sum of visits with `weights` (T,), each a mean of scans, relative to one scan."""
     return float(np.sqrt(sum(w**2 / len(visit.rows) for w, visit in zip(weights, visits, strict=True))))
 
 

@@ -369,7 +369,9 @@ class _Factor:
 
 
 def _rename_column(tree: ast.expr, column: str) -> ast.expr:
-    """Return a checked call with `column` for its innermost first argument."""
+    """Return a nested call with `column` as the first argument of its innermost call; each `cr` gets centred
+    constraints.
+    """
     if isinstance(tree, ast.Call):
         # Without the constraint the columns of cr() contain the constant.
         centred = [ast.keyword("constraints", ast.Constant("center"))] if ast.unparse(tree.func) == "cr" else []

@@ -1002,9 +1002,9 @@ def _changes_in_pairs(
     design: Design, strata: ModelStrata, variable: Variable, other: Variable, config: CompareConfig,
     owners: Sequence[str] | None, *, unequal: bool,
 ) -> Iterator[tuple[tuple[FloatArray, FloatArray], tuple[float, float]]]:  # fmt: skip
-    """Yield the changes (P, K) by a variable in the two classes of each pair of another, and their precisions.
+    """Yield, for each pair of classes of `other`, the change (P, K) by `variable` in either class, and precisions.
 
-    There are none if the changes of the two variables belong to different strata.
+    Nothing is yielded if the changes of the two variables belong to different strata.
     """
     both = frozenset({variable.column, other.column})
     low, high = _pairs(variable)[0]

@@ -176,7 +176,7 @@ class _SharedEstimates:
         landmarks: landmarks on the surfaces.
         regions: (P, V) 1 for the vertices of each region, the complete surface first.
         uncertainty: source of the standard deviations, as in `ChangeResult`.
-        time_unit: unit of rates; empty if times are words.
+        time_unit: unit of time of the rates; empty if times are words, for which no rates are computed.
         is_closed: whether the surface is closed.
     """
 

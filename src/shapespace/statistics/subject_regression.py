@@ -125,7 +125,7 @@ class SubjectRegression:
         return np.add.reduceat(values, self._starts, axis=0)
 
     def _correct_leverage(self, values: FloatArray, columns: FloatArray) -> FloatArray:
-        """Return rows (N, c), those of each subject times the inverse root of 1 less its part of the hat matrix."""
+        """Return `values` (N, c), the rows of each subject times (I - H)^(-1/2), H its block of the hat matrix."""
         out = np.empty_like(values)
         for first, last in pairwise([*self._starts, len(values)]):
             own = columns[first:last]

@@ -95,7 +95,7 @@ class Guard:
         cookie_name: browsers share cookies between ports, so the name should contain the port.
         loopback: whether only this machine can reach the server; requests for other host names are then rejected.
         framed: whether notebooks on this machine may show the page in a frame.
-        frames: whether pages show others of the application in frames.
+        frames: whether pages of the application may show other pages of the application in frames.
     """
 
     def __init__(

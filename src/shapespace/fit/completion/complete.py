@@ -340,7 +340,7 @@ def complete(
     model = model if isinstance(model, ShapeModel) else ShapeModel.load(Path(model))
     if model.is_n_training_known and model.n_training < _FEWEST_SHAPES:
         raise InputError(
-            f"The model was made of {model.n_training} shapes; a completion needs one of at least {_FEWEST_SHAPES}."
+            f"The model was built from {model.n_training} shapes; a completion needs one of at least {_FEWEST_SHAPES}."
         )
     landmarks = read_landmarks(Path(landmarks)) if isinstance(landmarks, str | PathLike) else landmarks
     fit = fit_scan(model, scan, config.fit, landmarks=landmarks, T_scan_model=T_scan_model)

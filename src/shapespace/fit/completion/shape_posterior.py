@@ -112,7 +112,7 @@ class ShapePosterior:
 
     @property
     def mean_square_z(self) -> float:
-        """Mean square of the coefficients of the model's own modes in standard deviations of new shapes."""
+        """Mean square of the coefficients of the model's own modes, in standard deviations among new shapes."""
         return float((self.b[: self.n_modes] ** 2 / self.prior_variance[POSE : POSE + self.n_modes]).mean())
 
     def draw_displacements(self, count: int, rng: np.random.Generator) -> Float32Array:

@@ -51,7 +51,9 @@ class SurfaceCalibration:
 
     @property
     def skill(self) -> FloatArray:
-        """(V,) share of the mean shape's squared error that the completion removes; at most 1, negative if worse."""
+        """(V,) reduction of the squared error by the completion, as a share of that of the mean shape; at most 1,
+        negative if the completion is worse.
+        """
         own, mean = ((errors.astype(np.float64) ** 2).sum(axis=(0, 2)) for errors in (self.errors, self.mean_errors))
         return 1.0 - own / np.maximum(mean, 1e-30)
 

@@ -10,7 +10,8 @@ from typing import Any
 
 
 class ReasonCode(StrEnum):
-    """Reasons for a status; the value is the code in NAME.fit.json, the comment lists the data.
+    """Reasons for the status of a fit; the value is the code in NAME.fit.json, the comment lists the data saved with
+    it.
 
     Example:
         >>> [reason.code for reason in fit.reasons if reason.code is ss.fit.ReasonCode.OTHER]

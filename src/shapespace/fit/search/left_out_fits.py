@@ -30,7 +30,6 @@ def fit_left_out(
     Args:
         model: shape model with its training shapes; nothing is yielded without them.
         fitted: result of the fit to the scan.
-        fitted: result of the fit to the scan.
         settings: settings of the robust method.
         with_scale: whether the pose has a free scale.
     """

@@ -227,8 +227,8 @@ def find_layers(model: ShapeModel, target: ScanTarget, fitted: RobustFitted) -> 
     """Return the share of the scan with two surfaces on top of each other, and their distance.
 
     Around a point of such a scan the heights over the fitted surface fall into two tight groups with a gap between.
-    Noise leaves no gap, and points scattered off the surface form no tight group. Both are zero if matched points are
-    so close to the surface that the search is skipped.
+    Noise leaves no gap, and points scattered off the surface form no tight group. Share and distance are zero if no
+    such points are found, or if the matched points are so close to the surface that the search is skipped.
 
     Args:
         model: the shape model.

@@ -135,4 +135,4 @@ def _cells(vector: Any) -> tuple[str, ...]:
     if len(getattr(vector, "shape", ())) != 1:
         return ()
     values: list[Any] = np.ma.filled(np.ma.asarray(vector).astype(object), None).tolist()
-    return tuple("" if value is None or value != value else str(value) for value in values)
+    return tuple("" if value is None or value != value else str(value) for value in values)  # noqa: PLR0124 (NaN)

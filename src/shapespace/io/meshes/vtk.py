@@ -128,7 +128,7 @@ class _Cursor(WordCursor):
             self.position = end + 1
 
     def skip_metadata(self) -> None:
-        """Move past a METADATA section, which a blank line ends."""
+        """Move past a METADATA section, which ends at a blank line."""
         blank = _BLANK_LINE.search(self.data, max(self.position - 1, 0))
         if blank is None:
             raise damage_error(self.path, f"it ends among its METADATA; {CUT_SHORT}")

@@ -184,7 +184,8 @@ def decoded_text(content: bytes) -> str:
     """Return the text of a file: UTF-8, UTF-16 with a byte order mark, or else Windows Latin-1 (code page 1252).
 
     Raises:
-        ValueError: it is not text in these encodings; the message is a clause.
+        ValueError: the content begins with a byte order mark of UTF-16 but is not valid UTF-16; the message has no
+            subject, so that the caller can put the file name before it.
     """
     try:
         return content.decode("utf-16" if content.startswith(_UTF_16) else "utf-8-sig")

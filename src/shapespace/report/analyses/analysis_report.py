@@ -123,7 +123,7 @@ class ResultTable:
 
 
 def floats(values: npt.NDArray[Any] | Sequence[float]) -> tuple[float, ...]:
-    """Return numbers as a tuple for a part."""
+    """Return numbers as a tuple of floats, as the fields of a `Part` require."""
     return tuple(map(float, values))
 
 

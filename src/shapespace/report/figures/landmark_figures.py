@@ -76,7 +76,7 @@ def deformation_grid_figure(low: FloatArray, high: FloatArray, labels: tuple[str
     """
     ends = np.stack([low, high])
     if np.ptp(ends[:, :, 2]) > 0:
-        raise InputError("A deformation grid needs planar landmarks; draw vectors of three-dimensional ones.")
+        raise InputError("A deformation grid needs planar landmarks; draw vectors for landmarks in 3-D instead.")
     ends = (ends @ _first_rotation().T)[:, :, :2]
     splines = [ThinPlateSpline.fit(ends.mean(axis=0), end) for end in ends]
     lines = grid_lines(ends.mean(axis=0))

@@ -299,8 +299,8 @@ def upright(mean: Mesh, turns: Sequence[FloatArray] = ()) -> FloatArray:
     """Return the rotation (3, 3) that brings the mean shape upright: +y up, its front along +z.
 
     If the scans share a pose, the mean shape gets the mean of their poses. Otherwise its longest axis is vertical, with
-    the narrower end below, and its front is the side to which an open surface opens, or the shortest axis if it is
-    closed.
+    the narrower end below, and its front is the side opposite the opening of an open surface, or lies along the
+    shortest axis of a closed one.
 
     Args:
         mean: mean shape.

@@ -296,7 +296,7 @@ def _in_picture_frame(mesh: Mesh, fit: SavedFit) -> Mesh:
     with np.errstate(all="ignore"):  # overflow is rejected below
         vertices = mm * ((mesh.vertices - np.array(T.translation)) @ np.array(T.rotation))
     if not (len(vertices) and np.isfinite(vertices).all()):
-        raise FileFormatError(f"{fit.name}: its surface, its scan or its pose has no finite coordinates; {_AGAIN}.")
+        raise FileFormatError(f"{fit.name}: its surface or scan is empty, or it or the pose is not finite; {_AGAIN}.")
     return mesh.with_vertices(vertices)
 
 

@@ -290,7 +290,7 @@ class CorrespondencePage:
         ]
 
     def _boards(self) -> list[CorrespondRecord]:
-        """Return the scans of the checkerboards: those that need review, and some evenly from the others."""
+        """Return the scans to draw with a checkerboard: those that need review first, then others at even steps."""
         first = self.looked_at[: MOST_BOARDS // 2 + 1] if len(self.records) > MOST_BOARDS else list(self.ordered)
         rest = [record for record in self.ordered if record not in first]
         room = MOST_BOARDS - len(first)

@@ -248,7 +248,7 @@ def _asset(name: str) -> str:
 
 
 def _script(text: str) -> str:
-    """Return a script of ours so that it does not end its own element; the two marks occur in its strings only."""
+    """Return a script of this package with `</script` and `<!--` escaped; both occur in its strings only."""
     return text.replace("</script", "<\\/script").replace("<!--", "<\\!--")
 
 

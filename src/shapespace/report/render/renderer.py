@@ -268,7 +268,7 @@ def visible_triangles(mesh: Mesh, *, camera: Camera, size: tuple[int, int]) -> t
 
 
 def _view_axes(yaw_deg: float, pitch_deg: float) -> FloatArray:
-    """Return the rows right, up and towards the eye, (3, 3), in world coordinates."""
+    """Return a (3, 3) matrix whose rows are the directions right, up and towards the eye, in world coordinates."""
     yaw, pitch = np.radians([yaw_deg, pitch_deg])
     turn = np.array([[np.cos(yaw), 0, np.sin(yaw)], [0, 1, 0], [-np.sin(yaw), 0, np.cos(yaw)]])
     tilt = np.array([[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]])

@@ -30,15 +30,17 @@ class IdentityConfig:
         gallery: scans to enrol, such as `expression=neutral` or `session!=2,3` (default: verify compares all scans with
             all, identify enrols the first scan of each subject).
         probe: scans to compare with the gallery (default: all that are neither enrolled nor used for training).
-        train: training scans (default: the subjects of the other folds).
+        train: training scans (default: the scans of the subjects in the other folds).
         role: column with `gallery`, `probe` or `train` for each scan, instead of the expressions (default: role, if the
             table has it).
-        folds: folds of subjects; the other folds train the scores (default: 4, fewer for fewer than 8 subjects).
+        folds: number of folds of subjects; each is tested with scores trained on the others (default: 4, fewer for
+            fewer than 8 subjects).
         scores: scores among `plda`, `cosine`, `mahalanobis` and `distance`; the summary reports the first (default:
             all).
         modes: number of leading coefficients of identity to use (default: all).
         curve: numbers of modes for which the equal error rate is also computed.
-        by: column of the probes, for whose values results are also reported.
+        by: column of the table; results are also reported for each of its values, from pairs whose probe has this value
+            (without a gallery: one of whose scans has it).
         uncertainty: whether the PLDA score uses the estimated error of each fit.
         draws: number of bootstrap samples of subjects, from which intervals are computed.
         seed: seed of folds and bootstrap samples.
@@ -66,7 +68,7 @@ class IdentityConfig:
 
 @dataclass(frozen=True)
 class Round:
-    """Rows of a cohort: training rows, and the compared rows of other people."""
+    """Row numbers in a cohort: the training scans, and the gallery and probe scans of other people."""
 
     training: tuple[int, ...]
     gallery: tuple[int, ...]

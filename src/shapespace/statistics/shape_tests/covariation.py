@@ -67,7 +67,7 @@ def fit_pls(
         True
     """
     if bool(columns) == (modules is not None):
-        raise InputError("Partial least squares needs --columns of the table as the first block, or --modules.")
+        raise InputError("Partial least squares needs either --columns of the table as the first block, or --modules.")
     cohort = cohort.complete(columns, drop_missing=drop_missing, numbers=columns)
     if modules is None:
         given = np.column_stack([cohort.table.numbers(column) for column in columns])

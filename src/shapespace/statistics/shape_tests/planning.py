@@ -145,7 +145,7 @@ def _simulator(
     """Return a function that simulates centred shapes (n, d) of groups (n,), in rotated axes, by a smoothed bootstrap.
 
     Residuals (N, K) of all groups are pooled after division by the standard deviation of their group. The noise lies in
-    their span, so that a singular covariance stays one.
+    the span of these residuals, so that a singular covariance stays singular.
     """
     # Smoothed bootstrap (Silverman and Young 1987)
     _, axes, variances = principal_components(residual / deviations[groups.codes, None])

@@ -469,7 +469,7 @@ def _remove_column(state: State, request: Mapping[str, Any]) -> tuple[str, State
         replace(specimen, cells={key: cell for key, cell in specimen.cells.items() if key != column})
         for specimen in state.specimens
     )
-    kept = tuple(column for column in state.columns if column != column)
+    kept = tuple(name for name in state.columns if name != column)
     return f"remove the column {column}", replace(state, columns=kept, specimens=specimens)
 
 
