@@ -230,7 +230,7 @@ def test_blocks_that_cannot_covary_are_refused(tmp_path: Path) -> None:
     assert len(fit_pls(cohort, columns=("b",), permutations=2, drop_missing=True).cohort) == 19
     with pytest.raises(InputError, match="no column 'c'"):
         fit_pls(cohort, columns=("c",))
-    with pytest.raises(InputError, match="needs --columns"):
+    with pytest.raises(InputError, match="needs either --columns"):
         fit_pls(cohort)
     shapes[:, :3] = 0.0
     with pytest.raises(InputError, match="The block of A is the same for all shapes"):

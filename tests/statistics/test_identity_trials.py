@@ -90,8 +90,8 @@ BAD = {
     "one fold": (replace(FEW, folds=1), "cannot be split into 1 folds"),
     "a score that is none": (replace(FEW, scores=("cosine", "sine")), "not sine"),
     "no score": (replace(FEW, scores=()), "an empty list"),
-    "too many modes": (replace(FEW, modes=7), "1 to 6, that of coefficients, not 7"),
-    "no mode": (replace(FEW, curve=(0,)), "1 to 6, that of coefficients, not 0"),
+    "too many modes": (replace(FEW, modes=7), "1 to 6, as there are coefficients, not 7"),
+    "no mode": (replace(FEW, curve=(0,)), "1 to 6, as there are coefficients, not 0"),
     "by what is not there": (replace(FEW, by="mood"), "has no column 'mood'"),
 }
 

@@ -205,7 +205,7 @@ def read_cohort(
     """
     if is_cohort_file(data):
         if config is not None:
-            raise InputError(f"{data} contains the settings of the cohort; remove the others, or give its table.")
+            raise InputError(f"{data} contains the settings of the cohort; omit config, or give its table.")
         data, stated = read_cohort_file(Path(data))
         config = CohortConfig(**stated)
     config = config or CohortConfig()

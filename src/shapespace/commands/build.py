@@ -100,7 +100,7 @@ class BuildFilesConfig:
             raise InputError("--min-seen is for models of vertices without --additive; leave it out.")
         if self.labels is not None and not self.model.align:
             raise InputError(
-                "A model that parts identity and expression aligns its faces itself; leave --no-align out."
+                "A model that separates identity and expression aligns its faces itself; leave --no-align out."
             )
         if self.streams and (self.labels is not None or self.model.representation != "vertices"):
             raise InputError(
@@ -261,7 +261,7 @@ def _load_parent(path: Path, output: Path) -> ShapeModel:
         raise InputError(f"{output} is the model that meshes are added to; give another name for the new one.")
     model = ShapeModel.load(path)
     if model.held_out or model.representation != "vertices":
-        reason = "parts identity and expression" if model.held_out else "is of B-spline surfaces"
+        reason = "separates identity and expression" if model.held_out else "is of B-spline surfaces"
         raise InputError(f"{path} {reason}, and meshes can be added only to plain models of vertices; build it again.")
     return model
 
@@ -360,7 +360,7 @@ def _find_landmarks(
 def _landmarks_of_parent(
     files: Sequence[Path], records: Mapping[Path, FitRecord], first: Mesh, notes: list[str]
 ) -> SurfaceLandmarks:
-    """Return the landmarks of the one model that fitted all `files`: they are on its vertices, in its order."""
+    """Return the landmarks of the one model that fitted all `files`, whose vertices have the order of the model."""
     models = [record.model for record in records.values()]
     if len(records) < len(files) or not all(model.hash for model in models):
         return SurfaceLandmarks()

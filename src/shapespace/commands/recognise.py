@@ -80,8 +80,8 @@ def recognise_train(
         neutral: label of neutral faces.
         confidence: predict `unsure` below this probability.
         modes: number of leading coefficients to use (default: all).
-        expression_of: use the expression coefficients alone, of this model of `build --additive`, which must be the one
-            that the scans were fitted with.
+        expression_of: model of `build --additive` that the scans were fitted with; only its expression coefficients are
+            used.
         seed: seed of the folds, and of classifiers that draw.
 
     Raises:
@@ -89,7 +89,7 @@ def recognise_train(
         FileFormatError: results or labels are damaged.
         InputError: invalid input of `train_classifier`, fits of another model than `expression_of`, or a name that does
             not end in .skops.
-        ModelFileError: `expression_of` does not part identity and expression.
+        ModelFileError: `expression_of` does not separate identity and expression.
         ShapespaceError: the extra `recognise` is not installed.
     """
     from shapespace.model.additive import AdditiveModel
@@ -213,7 +213,7 @@ def recognise_transfer(model: Path, person: Path, expression: Path, output: Path
     Raises:
         FileError: something cannot be read, or the mesh not written.
         FileFormatError: a record is damaged.
-        InputError: the model does not part identity and expression, or a fit is of another one.
+        InputError: the model does not separate identity and expression, or a fit is of another one.
     """
     from shapespace.model.additive import AdditiveModel
 

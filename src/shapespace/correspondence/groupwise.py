@@ -855,7 +855,7 @@ def _finished_state(problem: _RunConstants, finished: FinishedCorrespondence) ->
 def _added_states(
     problem: _RunConstants, start: RegistrationState, added: Sequence[int], run: Runner
 ) -> dict[int, RegistrationState]:
-    """Return for each scan of `added` the state of the finished scans and this scan, after its last round."""
+    """Return for each scan of `added` the state after its last round, with the finished scans and this one only."""
     shapes = start.shapes(sorted(start.registrations))[0]
     prior = shapes if len(shapes) >= ENOUGH_TO_JUDGE else None
     pose_models = (PoseModel.of(start.template, prior),)  # it is trained without all added scans

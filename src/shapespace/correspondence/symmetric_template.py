@@ -143,7 +143,7 @@ def _check_symmetry(mirror: SurfaceMirror, name: str) -> None:
 
 
 def _plane_frame(vertices: FloatArray, normal: FloatArray, offset: float, scale: float) -> Similarity:
-    """Return the similarity to a frame in which a plane is x = 0, with the centre of `vertices` projected to 0."""
+    """Return the similarity to a frame with a plane at x = 0 and the centre of `vertices`, projected onto it, at 0."""
     rotation = np.linalg.svd(normal[None])[2]
     rotation[0] = normal
     rotation[2] *= np.linalg.det(rotation)

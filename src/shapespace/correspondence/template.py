@@ -183,7 +183,7 @@ def choose_template(scans: Sequence[Mesh], seed: int) -> TemplateChoice:
 
 
 def _candidates(incompleteness: FloatArray, most: int, rng: np.random.Generator) -> npt.NDArray[np.intp]:
-    """Return the sorted indices of at most `most` scans, drawn from those of finite and small incompleteness."""
+    """Return the sorted indices of at most `most` scans, drawn from the most complete ones."""
     candidates = np.argsort(incompleteness, kind="stable")[: max(_CANDIDATES, len(incompleteness) // 2)]
     candidates = candidates[np.isfinite(incompleteness[candidates])]
     return np.sort(rng.choice(candidates, min(most, len(candidates)), replace=False))

@@ -1,9 +1,10 @@
 """Standard deviation of the position of each vertex along its surface, after a correspondence.
 
 Matches determine a position along the surface only as far as a patch around it cannot slide on itself: a plane slides
-along two directions, a cylinder along and around its axis, a sphere around its centre. This is the slippage of Gelfand
-and Guibas (Shape segmentation using local slippage analysis, SGP 2004), a posterior variance for matches along the
-normals. It is scaled by the deviation of the shape from the mean along the surface, since errors of matches grow with
+along two directions, a cylinder along and around its axis, a sphere around its centre. Slippage (Gelfand and Guibas,
+Shape segmentation using local slippage analysis, SGP 2004) is the posterior variance of such slides, if matches measure
+distances along the normals only. It is scaled by the deviation of the shape from the mean along the surface, since
+errors of matches grow with
 differences between shapes. Equations Cn are those of docs/correspondence.md.
 """
 

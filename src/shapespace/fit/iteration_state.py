@@ -52,7 +52,7 @@ class Fitted:
         T_scan_fitted: pose of the surface that was fitted, before its projection onto the model's modes.
         vertices_scan_mm: (V, 3) fitted surface in the scan's mm frame; it may leave the span of the model.
         outside_mm: RMS distance of the fitted surface from the span of the model, mm of the scan.
-        regions: function that finds the code of each vertex, (V,), in `fit.regions.REGIONS`.
+        regions: function that finds the code of each vertex, (V,), in `REGIONS`.
         evidence: diagnostics from which the status is computed; None of a method without diagnostics.
         b_covariance: (K, K) covariance of the coefficients, mm^2; None if the method does not estimate it.
         notes: sentences on problems of the scan.

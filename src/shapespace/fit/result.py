@@ -170,9 +170,9 @@ class FitResult:
 
     @cached_property
     def regions(self) -> IntArray:
-        """(V,) code of each model vertex in `fit.regions.REGIONS`, found on first access.
+        """(V,) code of each model vertex in `fit.iteration_state.REGIONS`, found on first access.
 
-        The paper's method follows every vertex, observed or not. Outside the region of a region fit
+        With the paper's method every vertex counts as followed, observed or not. Outside the region of a region fit
         (`FitConfig.region`) no vertex is observed.
         """
         return self.find_regions()
@@ -352,7 +352,7 @@ def stage_arrays(result: FitResult, model: ShapeModel) -> dict[str, npt.NDArray[
 
     For each stage it contains the vertices (V, 3) and the signed distances `model_to_scan_STAGE` (V,) and
     `scan_to_model_STAGE` (S,), positive where the scan lies outside of the model, not-a-number at scan points beyond
-    the model's rim. `scan` and `scan_faces` are the repaired scan; `regions` the codes of `fit.regions.REGIONS`;
+    the model's rim. `scan` and `scan_faces` are the repaired scan; `regions` codes of `fit.iteration_state.REGIONS`;
     `history_*` each iteration, with T (I, 3, 4) from the model's frame then to the picture frame. If the scan has
     colours, it also contains `scan_colours` (S, 3), `colours_final` and `colours_dense` (V, 3), uint8.
     """

@@ -262,7 +262,7 @@ def cover_children(boxes: FloatArray, first_leaf: int) -> None:
 
 @compiled
 def _boxes_of_leaves(points: FloatArray, boxes: FloatArray, depth: int) -> None:
-    """Fill `boxes` of `points` in leaf order, leaves first."""
+    """Fill `boxes`, first of the leaves, then of their parents; `points` are in the order of the leaves."""
     count, first_leaf = len(points), (1 << depth) - 1
     for leaf in range(1 << depth):
         box = boxes[first_leaf + leaf]

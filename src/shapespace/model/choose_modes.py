@@ -50,7 +50,7 @@ def made_by_alignment(
 
 
 def below_precision(variance: FloatArray, n: int, coordinates: int, rounding_mm: float) -> BoolArray:
-    """Return which of the variances (K,), mm^2, of n shapes of that many coordinates rounding alone can cause."""
+    """Return whether (K,) rounding alone can cause each variance, mm^2, in n shapes with this many coordinates."""
     return variance <= (_COARSE * rounding_mm * (1.0 + np.sqrt(coordinates / max(n - 1, 1)))) ** 2
 
 

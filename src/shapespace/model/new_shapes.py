@@ -77,7 +77,7 @@ def variances_of_new_shapes(
 
 
 def whole_spectrum(sample: FloatArray, total: float, n: int) -> FloatArray:
-    """Return the variances of all n - 1 modes, mm^2: those of the first, `sample` (K,), and equal parts of the rest."""
+    """Return variances of up to n - 1 modes, mm^2: `sample` (K,), then equal parts of the remainder, if any."""
     rest, left = n - 1 - len(sample), total - float(sample.sum())
     return np.concatenate([sample, np.full(rest, left / rest)]) if rest > 0 and left > _ALL_KEPT * total else sample
 

@@ -145,7 +145,7 @@ def ppca(
 
 
 def _from_complete(shapes: FloatArray, modes: int) -> tuple[FloatArray, float]:
-    """Return W (V, 3, K + 1), with a mean of zero last, and the noise: the maximum likelihood of complete shapes."""
+    """Return W (V, 3, K + 1), whose last column, the mean, is zero, and the noise, most likely for complete shapes."""
     n, vertices = shapes.shape[:2]
     flat = (shapes - shapes.mean(axis=0)).reshape(n, -1)
     values, vectors = np.linalg.eigh(flat @ flat.T)

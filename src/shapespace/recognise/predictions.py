@@ -167,8 +167,8 @@ def nested_predictions(
 
     The training people are again split by person: first the number of leading modes is chosen by LDA, then the
     classifier and its parameters with this number, each by macro accuracy of the held-out samples. The probabilities of
-    the chosen classifier on those samples give the temperature that calibrates it. Then it is fitted to all training
-    people.
+    the chosen classifier on those samples give the temperature that calibrates it. Then the classifier is fitted to all
+    training people.
 
     Args:
         folds: outer folds.

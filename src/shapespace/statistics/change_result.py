@@ -45,8 +45,8 @@ class ChangeConfig:
         permutations: number of permutations.
         seed: seed of the permutations.
         variances: assumption on the variances of the groups: `equal` permutes subjects, `unequal` computes Welch's t
-            and flips signs, `auto` uses `unequal` if groups may differ in dispersion: p of its test is at most 0.3, or
-            0.05 for groups of the same size.
+            and flips signs, `auto` uses `unequal` if groups may differ: p is at most 0.3 for dispersion or 0.1 for
+            form, or 0.05 for either in groups of the same size.
         drop_missing: exclude shapes with missing values in the table (default: an error).
     """
 

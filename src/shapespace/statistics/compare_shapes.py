@@ -85,8 +85,8 @@ class CompareConfig:
         random: random effects: the effects within subjects that differ between subjects, such as `1 + time | subject`;
             all others are assumed to be equal in all subjects (default with blocks: all).
         variances: assumption on the variances of the classes: `equal` permutes residuals, `unequal` has a variance for
-            each subject and flips the signs of residuals, `auto` uses `unequal` if classes may differ in dispersion: p
-            of its test is at most 0.3, or 0.05 for classes of the same size.
+            each subject and flips the signs of residuals, `auto` uses `unequal` if classes may differ: p is at most 0.3
+            for dispersion or 0.1 for form, or 0.05 for either in classes of the same size.
         effect_size: transformation of F in the effect size Z: `box-cox`, as in RRPP from version 0.6, or `log`, as in
             earlier versions.
         weights: weights of the vertices in the sums of squares: `confidence`, smaller where the position along the
@@ -534,7 +534,7 @@ def _random_effects(config: CompareConfig, cohort: Cohort) -> tuple[tuple[frozen
 
 
 def _weight_root(cohort: Cohort) -> FloatArray | None:
-    """Return L (K, K), so that coefficients C have the sums of squares of C L with vertices weighted by confidence.
+    """Return L (K, K): C L has the sums of squares that coefficients C have with vertices weighted by confidence.
 
     The weight is v / (v + s^2), with the variance v of a coordinate, mean over the vertices, and `position_std` s. It
     does not depend on the table, so that rows stay exchangeable. None if `position_std` is not known.
@@ -1052,9 +1052,9 @@ def _changes_in_pairs(
 def _changes_of(
     stratum: Stratum, variables: frozenset[str], contrast: FloatArray, config: CompareConfig, units: Units | None
 ) -> tuple[FloatArray, float]:
-    """Return a contrast (P, K) in each arrangement of the model without the terms of some variables, and its precision.
+    """Return a contrast (P, K) in each arrangement under the model without `variables`, and its precision.
 
-    The common change of that model is shortened to its length without noise; in `units` variances may differ.
+    It includes the change that this model fits, at its length without noise; variances of `units` may differ.
     """
     reduced, direction = stratum.without(variables), stratum.direction(contrast)
     if units is not None and units.is_comparable and stratum.width == 1:

@@ -220,7 +220,7 @@ class WithinSubjects:
         return stratum, between
 
     def _between_design(self, effects: Sequence[int]) -> tuple[tuple[Term, ...], Design]:
-        """Return the terms that contain some effects, and the design of their parts between subjects."""
+        """Return the terms that contain any of `effects`, and the design of their factors between subjects."""
         chosen = [term for effect in effects for term in self.terms[effect]]
         chosen.sort(key=self.design.terms.index)
         parts = sorted(dict.fromkeys(term.factors - self.factors for term in chosen), key=len)

@@ -1,17 +1,19 @@
 """Unequal group dispersion: a test for it, and statistics and null distributions that allow it.
 
 A permutation test of means assumes that residuals are exchangeable between groups. If the smaller group is more
-variable, it finds differences that do not exist; if the larger group is, it misses differences. Here
+variable, the test finds differences that do not exist; if the larger group is, it misses differences. Here
 
 - dispersions are compared by the distances of residuals to their group mean (Anderson, Biometrics 62, 2006), each
   divided by sqrt(1 - leverage) against the bias of small groups (Stier et al., Ecology 94, 2013);
-- a mean difference is divided by its variance with a variance for each row (the ANOVA-type statistic of Brunner,
+- a squared mean difference is divided by its variance, with one variance for each row (the ANOVA-type statistic of
+Brunner,
   Dette and Munk, JASA 92, 1997, with the leverage correction HC2 of MacKinnon and White, J. Econometrics 29, 1985; of
   two groups the squared Welch t), and compared with sign flips of the residuals of the reduced model (the restricted
   wild bootstrap of Davidson and Flachaire, J. Econometrics 146, 2008), which is fitted with a weight for each group.
 
-Sign flips keep the variance of each row, so covariances may differ between groups in size and in form. Classes that
-have few different sign flips are rotated (Langsrud, Stat. Comput. 15, 2005), which assumes normal residuals.
+Sign flips keep the variance of each row, so covariances may differ between groups in size and in form. Residuals of
+classes with few different sign flips are rotated instead (Langsrud, Stat. Comput. 15, 2005), which assumes that they
+are normal.
 """
 
 from __future__ import annotations

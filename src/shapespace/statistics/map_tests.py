@@ -205,7 +205,7 @@ def _permute(
 
 
 def _critical(maxima: FloatArray) -> float:
-    """Return the value that the largest statistics (P,) of a share of `LEVEL` of the arrangements exceed."""
+    """Return the value that the largest statistic (P,) exceeds in a share of `LEVEL` of the arrangements."""
     return float(np.sort(maxima)[-(int(LEVEL * len(maxima) * (1 + _TIE)) + 1)])
 
 

@@ -323,7 +323,7 @@ def _groups(cohort: Cohort, config: ChangeConfig, visits: Visits, single: Sequen
     if len(counts) != 2 or min(counts.values()) < 2:
         counted = ", ".join(f"{group}: {count}" for group, count in sorted(counts.items())[:5])
         raise InputError(
-            f"{where}: {config.group!r} must part the subjects with two visits into two groups of two or more, not "
+            f"{where}: {config.group!r} must divide the subjects with two visits into two groups of two or more, not "
             f"{counted}; choose another column."
         )
     return group_of_subject

@@ -119,7 +119,7 @@ class Predictor:
         return lazy_import("html_of_predictor")(self)
 
     def predict(self, cohort: Cohort) -> Predictions:
-        """Predict the number from the shapes of a cohort, of subjects that are not in the training data.
+        """Predict the number from the shapes of a cohort whose subjects are not in the training data.
 
         Predictions of completed shapes with samples combine the imputations by Rubin's rules.
 

@@ -128,7 +128,7 @@ class SurfaceFiles:
         return replace(mesh, vertices=mesh.vertices / ratio, position_std=std)
 
     def review(self, files: Iterable[Path], option: str = "", *, accept: bool) -> SurfaceReview:
-        """Return the number of `files` that need review by the records of their correspondence.
+        """Return how many of `files` need review, and why, by the records of their correspondence.
 
         Args:
             files: files of the surfaces that are used, doubtful ones included.

@@ -152,7 +152,7 @@ def shape_posterior(
         marks: landmarks of the scan, if any.
         calibrated: whether to estimate the error from the training shapes (E4), which a comparison of poses does not
             need.
-        settled: whether to stay at the fit.
+        settled: whether to linearise at the fit itself; False first iterates from it to the optimum.
 
     Raises:
         FitError: hardly any point of the scan matches, or the scan does not determine the pose.

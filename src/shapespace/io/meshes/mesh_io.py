@@ -104,8 +104,8 @@ def read_mesh(path: Path | str) -> Mesh:
 def probe_mesh(path: Path) -> None:
     """Check a mesh file by its first 64 KiB and its size, without reading the complete file.
 
-    The file must be readable, have a known ending, not be empty and not be too long; PLY and binary STL must be as long
-    as their header declares. A file that passes may still be damaged in a later part.
+    The file must be readable, have a known ending, not be empty and not be too long; PLY and binary STL must be at
+    least as long as their header declares. A file that passes may still be damaged in a later part.
 
     Raises:
         FileError: see `read_mesh`.
@@ -224,7 +224,7 @@ def mesh_files(
     endings: Sequence[str] = MESH_FILE_ENDINGS,
     kind_name: str = "meshes",
 ) -> MeshFiles:
-    """Return `paths` with each folder replaced by its meshes, or by its files with other `endings`.
+    """Return `paths` with each folder replaced by the files in it that have one of the `endings`.
 
     Args:
         paths: files, which are always included, and folders.

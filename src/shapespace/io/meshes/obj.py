@@ -46,7 +46,7 @@ def read_obj(data: bytes, path: Path) -> Mesh:
     """Read OBJ: one vertex for each `v` line, in the file's order, and polygons as fans.
 
     Negative indices count back from the last `v` line above. Colours are those after `x y z` if all vertices have them,
-    or else of the textures of its materials; a note gives the reason if a texture cannot be read. Weights are ignored.
+    or else those of the textures; a note gives the reason if a texture cannot be read. Weights are ignored.
 
     Args:
         data: complete content of the file.

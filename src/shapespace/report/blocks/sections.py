@@ -719,7 +719,7 @@ def _level(name: str, value: object) -> str:
 
 
 def _flat(key: str, values: Mapping[str, Any]) -> list[tuple[str, object]]:
-    """Return settings by `owner.name`, those of a part in its place; the steps have a table of their own."""
+    """Return (`owner.name`, value) of settings, nested ones too; without the steps, which have their own table."""
     out: list[tuple[str, object]] = []
     for name, value in values.items():
         if name == "levels":

@@ -420,7 +420,7 @@ def b_space(
     title: str = "",
     neutral: Coefficients | None = None,
 ) -> Figure:
-    """Draw b1, b2 and b3 (figure 10) from two sides, as `b_plane` does.
+    """Draw b1, b2 and b3 (figure 10) from two sides, with the arguments and markers of `b_plane`.
 
     Raises:
         InputError: no scans, or fewer than three coefficients.

@@ -93,11 +93,11 @@ class Folder:
         return cast(dict[str, Any], _printable(cast(object, content)))
 
     def arrays(self, name: object) -> dict[str, npt.NDArray[Any]]:
-        """Return the arrays of an .npz file by name; pickles, and arrays larger than the file declares, are rejected.
+        """Return the arrays of an .npz file by name; pickles and arrays that do not match their header are rejected.
 
         Raises:
             FileError: it cannot be read.
-            FileFormatError: it is damaged, or declares arrays that it does not contain.
+            FileFormatError: it is damaged, or contains other things than arrays.
         """
         with self._named_shortly():
             return arrays_at(self.path(name), self.again)
@@ -194,7 +194,7 @@ class SavedFit:
         """Return coefficients of the record, (K,).
 
         Raises:
-            FileFormatError: there are none, or not as many as coefficients.
+            FileFormatError: there are none, or another number of them than of `b`.
         """
         values = np.array(getattr(self.record, key), dtype=np.float64)
         if not len(values) or len(values) != len(self.record.b):
@@ -381,8 +381,8 @@ _SETTINGS = ("max_iterations", "seed", "landmark_stddev_mm")
 def command_with_stages(root: Path, records: Mapping[str, FitRecord]) -> str:
     """Return the command, to be run in the folder `root`, that fits the scans of `records` again and saves the stages.
 
-    The scans are those of the folder's list, which has landmarks and metadata too, if it contains these and no others;
-    otherwise, and for a scan without both, they are named one by one.
+    The command names the list of scans in the folder, which has landmarks and metadata too, if it lists exactly these
+    scans. Otherwise, and for a single scan without landmarks and metadata, it names the scans.
 
     Args:
         root: folder of the results.
@@ -454,7 +454,7 @@ class StagedFit:
         model_to_scan_mm: (V,) signed closest distances by stage: positive where the scan lies outside of the model;
             NaN at vertices that the scan does not show, as in `OverlapDistances`.
         scan_to_model_mm: (S,) signed closest distances of scan points by stage; NaN beyond the model's rim.
-        regions: (V,) codes of `fit.regions.REGIONS`; None if the stages were not saved.
+        regions: (V,) codes of `fit.iteration_state.REGIONS`; None if the stages were not saved.
         b: (K,) mm.
         z: (K,) in standard deviations of the model.
         b_stddev: (K,) mm.

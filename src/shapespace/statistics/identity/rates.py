@@ -81,7 +81,7 @@ class Roc:
         return float(self.far[before] + share * (self.far[after] - self.far[before]))
 
     def tar_at(self, far: float | FloatArray) -> FloatArray:
-        """Return the share of genuine pairs accepted at the largest threshold range whose FAR is at most `far`."""
+        """Return the share of genuine pairs accepted at the lowest threshold whose FAR is at most `far`."""
         return self.tar[np.searchsorted(self.far, np.asarray(far) * (1 + _JUST), side="right") - 1]
 
 

@@ -74,7 +74,9 @@ class Samples:
         if modes is None or modes == self.x.shape[1]:
             return self
         if not 1 <= modes <= self.x.shape[1]:
-            raise InputError(f"The number of modes must be 1 to {self.x.shape[1]}, that of coefficients, not {modes}.")
+            raise InputError(
+                f"The number of modes must be 1 to {self.x.shape[1]}, as there are coefficients, not {modes}."
+            )
         return replace(self, x=self.x[:, :modes], variance=self.variance[:, :modes])
 
 

@@ -522,7 +522,7 @@ def _lines(indicator: FloatArray, x: FloatArray, covariate: str) -> FloatArray:
     lines = np.hstack([indicator, indicator * x[:, None]])
     if (np.linalg.norm(less(lines[:, len(indicator.T) :], indicator), axis=0) <= _ALIASED * np.linalg.norm(x)).any():
         if indicator.shape[1] == 1:
-            raise InputError(f"{covariate!r} is the same for all shapes, which have no slope; choose another column.")
+            raise InputError(f"{covariate!r} is the same for all shapes, so there is no slope; choose another column.")
         raise InputError(f"{covariate!r} is constant within a group, which has no slope; exclude the group.")
     return lines
 
