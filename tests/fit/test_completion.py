@@ -236,7 +236,7 @@ def test_a_small_part_that_fits_in_two_poses_is_refused() -> None:
 def test_bad_input_has_one_sentence() -> None:
     scan = cut_scan(np.zeros(5), -0.2)[0]
     few = ShapeModel.fit(training_meshes(count=4, vertices=400), gauge="form")
-    with pytest.raises(InputError, match="made of 4 shapes"):
+    with pytest.raises(InputError, match="built from 4 shapes"):
         complete(few, scan, FORM)
     for wrong in ({"samples": 1}, {"mirror": "both"}, {"fit": FitConfig(method="paper")}):
         with pytest.raises(InputError):
