@@ -133,7 +133,9 @@
     links.forEach((link, k) => {
       if ((k === at) === link.hasAttribute("aria-current")) return;
       link.toggleAttribute("aria-current", k === at);
-      if (k === at) link.closest("ul").scrollLeft = link.offsetLeft - 60;
+      if (k !== at) return;
+      const list = link.closest("ul");
+      list.scrollLeft += link.getBoundingClientRect().left - list.getBoundingClientRect().left - 60;
     });
   }
   window.addEventListener("scroll", tellWhere, { passive: true });
