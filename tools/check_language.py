@@ -28,6 +28,7 @@ PATTERNS = {
     r"(?:^|[.:;] )What (?!(?:is|are|does|do|to)\b[^.]*\?)|\b(?:of|by|with|from|than|and|for) what\b": "name the thing",
     r"\bfrom nowhere\b|\bby itself\b|\bof the kind\b|\bsomebody\b": "a plain term",
 }
+"""Pattern -> the words to write instead."""
 ARGUMENT = re.compile(
     r"^\s{4,}[\w*, ]+: (?:of|by|that|which|whose|to|for|with|in|from|as|at|and|their|its|where|when)\b"
 )

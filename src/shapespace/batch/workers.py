@@ -27,6 +27,10 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast
 
 from shapespace.errors import FitError
 
+if TYPE_CHECKING:
+    from multiprocessing.connection import Connection
+    from multiprocessing.context import ForkServerContext, SpawnContext
+
 TaskT = TypeVar("TaskT", contravariant=True)
 AnswerT = TypeVar("AnswerT", covariant=True)
 
@@ -76,10 +80,6 @@ def is_first() -> bool:
         return True
     return True
 
-
-if TYPE_CHECKING:
-    from multiprocessing.connection import Connection
-    from multiprocessing.context import ForkServerContext, SpawnContext
 
 WARM_UP = "SHAPESPACE_WARM_UP"
 """Environment variable of the server: `notify` if it may report compilation on standard error, else `quiet`."""

@@ -671,8 +671,8 @@ COMMANDS: tuple[CommandSpec, ...] = (
             basic("--dimensions", "D", source=LANDMARKS_CONVERT, parse=values.positive),
         ),
         (
-            "Coordinates are exact. Prints what was scaled, interpreted as missing or omitted. Sliders are written "
-            "next to OUT as geomorph reads them. Files of R need the extra r.",
+            "Coordinates are exact. Prints the values that were scaled, interpreted as missing or omitted. Sliders are "
+            "written next to OUT as geomorph reads them. Files of R need the extra r.",
         ),
     ),
     CommandSpec(
@@ -1037,7 +1037,7 @@ COMMANDS: tuple[CommandSpec, ...] = (
             basic("--unit", "UNIT", "unit of IN, if its format does not contain it (default: mm)", choices=_UNITS),
             advanced("--expressions", "FILE.bin", source=CONVERT),
         ),
-        ("Prints what was kept, changed and omitted. Training shapes are always omitted.",),
+        ("Prints the parts that were kept, changed and omitted. Training shapes are always omitted.",),
     ),
     CommandSpec(
         "cache", "print the folder and size of the cache, or clear it", ("shapespace cache --clear",),

@@ -27,9 +27,9 @@ from shapespace.model.shape_model import ShapeModel, odd_size_notes
 from shapespace.model.streamed import (
     AlignedShapes,
     KeptShapes,
+    Log,
     Meshes,
     Scratch,
-    Tell,
     aligned_on_disk,
     check_extent,
     streaming_note,
@@ -116,7 +116,7 @@ def build_model(
     *,
     scratch: Scratch | None = None,
     keep_shapes: Path | None = None,
-    log: Tell | None = None,
+    log: Log | None = None,
 ) -> ShapeModel:
     """Build a shape model of meshes in correspondence, in mm (P1-P5).
 
@@ -223,7 +223,7 @@ def extend_model(
     *,
     scratch: Scratch | None = None,
     keep_shapes: Path | None = None,
-    log: Tell | None = None,
+    log: Log | None = None,
 ) -> ShapeModel:
     """Return the model of the training shapes of `model` and of `meshes`, without the meshes of the former.
 
@@ -276,7 +276,7 @@ def _model_of_streamed(
     config: BuildConfig,
     landmarks: Mapping[str, int],
     keep_shapes: Path | None,
-    log: Tell,
+    log: Log,
 ) -> ShapeModel:
     with stream as aligned:
         training = aligned.training

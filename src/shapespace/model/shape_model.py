@@ -42,7 +42,7 @@ from shapespace.types import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from shapespace.model.streamed import Meshes, Scratch, Tell
+    from shapespace.model.streamed import Log, Meshes, Scratch
 
 _PROJECTION_ITERATIONS = 200  # limit of the alternation of pose and coefficients
 _PROJECTION_TOLERANCE = 1e-10  # change of coefficients, in SD of the first mode, that ends it: float64 rounding
@@ -217,7 +217,7 @@ class ShapeModel:
         without_training_shapes: bool = False,
         scratch: Scratch | None = None,
         keep_shapes: Path | None = None,
-        tell: Tell | None = None,
+        tell: Log | None = None,
     ) -> ShapeModel:
         """Build a model of meshes in correspondence, mm (P1-P5); short for `build_model`.
 
@@ -251,7 +251,7 @@ class ShapeModel:
         seed: int = 0,
         scratch: Scratch | None = None,
         keep_shapes: Path | None = None,
-        tell: Tell | None = None,
+        tell: Log | None = None,
     ) -> ShapeModel:
         """Return the model of this model's training shapes and of `meshes`; see `build_model.extend_model`."""
         config = lazy_import("BuildConfig")(modes=modes, provenance=provenance, licence=licence, seed=seed)

@@ -42,7 +42,7 @@ from shapespace.model.pca import ALL_EQUAL, Modes, PrincipalComponents, checked_
 from shapespace.model.training_shapes import TrainingShapes
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, common_faces
 
-Tell: TypeAlias = Callable[[str], None]
+Log: TypeAlias = Callable[[str], None]
 _SHAPES, _START, _POSES, _ALIGNED = "shapes.f32", "start.npz", "poses.npz", "aligned"
 _IDENTITY, _LOCK = "identity.txt", "lock"
 _KEPT = "shapes.npz"
@@ -191,7 +191,7 @@ class AlignedShapes:
     training: KeptShapes
     passes: Path | None
 
-    def components(self, modes: Modes, seed: int, log: Tell) -> PrincipalComponents:
+    def components(self, modes: Modes, seed: int, log: Log) -> PrincipalComponents:
         """Return mean and modes, as `principal_components` does of shapes in memory.
 
         Raises:
@@ -275,7 +275,7 @@ def aligned_on_disk(
     scratch: Scratch | None,
     onto: KeptShapes | None,
     modes: Modes,
-    log: Tell,
+    log: Log,
 ) -> Generator[AlignedShapes]:
     """Yield the shapes of `meshes`, and before them those of `onto`, aligned in a file that is removed with the block.
 
@@ -371,7 +371,7 @@ class _Work:
         align: bool,
         alignment_vertices: IntArray | None,
         onto: KeptShapes | None,
-        log: Tell,
+        log: Log,
     ) -> None:
         if len(meshes) + (0 if onto is None else len(onto.sizes)) < 2:
             raise InputError(f"A shape model needs at least two meshes, not {len(meshes)}; one mesh has no variation.")

@@ -47,7 +47,7 @@ class Steps:
     """An array of 16-bit integers, perhaps times a scale, for `pack`.
 
     Args:
-        values: int16 or uint16, any shape; -32768 stands for NaN if there is a scale.
+        values: int16 or uint16, any shape; -32768 means NaN if there is a scale.
         scale: one positive number, one for each leading row, or None for integers that are what they are.
         coded: store differences from row to row, byte by byte, which deflate makes small where neighbours are alike.
         follows: name of an array packed before, of the same shape and scale; differences from it are coded.
