@@ -336,3 +336,75 @@ def test_a_run_goes_on_when_the_server_is_killed_and_the_tab_closed(open_tab, tm
         framed(tab)
         assert tab.page.get_by_test_id("job-1").get_attribute("data-status") == "done"
         assert tab.complaints == []
+
+
+PASTE = """(input, text) => {
+  const data = new DataTransfer();
+  data.setData("text/plain", text);
+  input.dispatchEvent(new ClipboardEvent("paste", { clipboardData: data, bubbles: true, cancelable: true }));
+}"""
+
+
+def test_pasted_rows_find_their_specimens_and_a_second_tab_and_a_press_lose_nothing(open_tab, tmp_path: Path) -> None:
+    names = [*(f"B{k}" for k in range(8, 12)), "B6AF1", "B6129"]
+    files = []
+    for k, name in enumerate(names, 1):
+        files.append(tmp_path / f"{name}.obj")
+        files[-1].write_text(f"v 0 0 0\nv {k} 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    project = tmp_path / "p"
+
+    def stored(column: str) -> dict[str, str]:
+        specimens = json.loads((project / "project.json").read_text())["specimens"]
+        return {one["id"]: one["cells"].get(column, "") for one in specimens}
+
+    with studio(project, tmp_path) as address:
+        tab, other = open_tab(address, WINDOW), open_tab(address, WINDOW)
+        tab.until("document.querySelector('[data-testid=drop-zone]') !== null")
+        tab.page.get_by_test_id("choose-files-input").set_input_files(files)
+        tab.until(f"document.querySelectorAll('[data-testid^=card-]').length === {len(names)}")
+        tab.until("document.querySelector('[data-testid=uploads-close]') !== null")
+        tab.page.get_by_test_id("layout-table").click()
+        first = sorted(names, key=lambda name: (name[1:2].isdigit(), name))[0]
+        # A sheet with its names and a new column, in the order of a spreadsheet, into a cell of names.
+        sheet = "\n".join(["specimen\tmass", *(f"{name}\t{len(name)}.{k}" for k, name in enumerate(sorted(names)))])
+        tab.page.get_by_test_id(f"cell-{first}-id").evaluate(PASTE, sheet)
+        tab.until(f"document.querySelector('[data-testid=cell-{first}-mass]')?.value.length > 0")
+        assert stored("mass") == {name: f"{len(name)}.{k}" for k, name in enumerate(sorted(names))}
+        # Values without names are shown with the specimens that they would go to.
+        shown = tab.page.evaluate(
+            "[...document.querySelectorAll('tr[data-testid^=row-]')].map((row) => row.dataset.testid.slice(4))"
+        )
+        tab.page.get_by_test_id(f"cell-{shown[0]}-mass").evaluate(PASTE, "\n".join("abcdefg"))
+        tab.page.get_by_test_id("paste").wait_for()
+        rows = tab.page.get_by_test_id("paste").locator("tbody tr").all_inner_texts()
+        assert [row.split() for row in rows] == [[name, letter] for name, letter in zip(shown, "abcdef", strict=True)]
+        assert "1 row is not pasted" in tab.page.get_by_test_id("paste-notes").inner_text()
+        tab.shot("paste")
+        assert barriers(tab) == []
+        tab.page.get_by_test_id("paste-cancel").click()
+        assert stored("mass")[first] != "a"
+        # A cell that is typed does not overwrite what another tab saves in the meantime.
+        other.page.get_by_test_id("layout-table").click()
+        cell = tab.page.get_by_test_id("cell-B8-mass")
+        cell.fill("7")
+        other.page.get_by_test_id("cell-B8-mass").fill("8")
+        other.page.keyboard.press("Enter")
+        other.until("document.querySelector('[data-testid=undo]').disabled === false")
+        tab.page.wait_for_timeout(800)
+        cell.press("Enter")
+        tab.page.locator("#message").wait_for()
+        assert "Another tab changed mass of B8 to '8'" in tab.page.locator("#message").inner_text()
+        assert stored("mass")["B8"] == "8" and cell.input_value() == "8"
+        # Nothing moves between press and release, so that the first click on Run counts.
+        tab.page.get_by_test_id("tab-correspondence").click()
+        long = tab.page.locator("[data-testid=form-correspond] .option:has(details.hint) >> visible=true").first
+        long.locator("input, select").first.focus()
+        run = tab.page.get_by_test_id("run-correspond")
+        box = run.bounding_box()
+        tab.page.mouse.move(box["x"] + 20, box["y"] + 10)
+        tab.page.mouse.down()
+        tab.page.wait_for_timeout(300)
+        assert run.bounding_box() == box
+        tab.page.mouse.up()
+        tab.page.get_by_test_id("job-1").wait_for()
+        assert other.complaints == []

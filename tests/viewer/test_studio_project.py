@@ -18,7 +18,15 @@ from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.types import Mesh
 from shapespace.viewer.studio.job_commands import checks, order
 from shapespace.viewer.studio.jobs import Job, Order, history
-from shapespace.viewer.studio.project import Project, StaleError, cells_of_table, change_of, with_cells
+from shapespace.viewer.studio.project import (
+    MatchedBlock,
+    PastedBlock,
+    Project,
+    StaleError,
+    cells_of_table,
+    change_of,
+    with_cells,
+)
 from synthetic_shapes import training_meshes
 
 
@@ -154,6 +162,94 @@ def test_a_table_is_joined_by_id_or_file_name_and_may_be_pasted(project: Project
     ):
         with pytest.raises((InputError, FileFormatError), match=error):
             join_table(project, content)
+
+
+def match(project: Project, text: str, column: str = "", at: str = "anna") -> MatchedBlock:
+    """Match a block as the page sends it: `text` has a line for each row, with tabs."""
+    order = ids(project)
+    rows = tuple(tuple(line.split("\t")) for line in text.split("\n"))
+    return PastedBlock(rows=rows, column=column, order=tuple(order[order.index(at) :])).match(project.state)
+
+
+@pytest.fixture
+def weighed(project: Project) -> Project:
+    join_table(project, b"id,sex,weight\nanna,,\nben,,\n")
+    return project
+
+
+RIGHT = {"anna": {"sex": "f", "weight": "3.5"}, "ben": {"sex": "m", "weight": "4"}, "carl": {"sex": "m", "weight": "5"}}
+
+
+@pytest.mark.parametrize(("text", "column", "at"), [
+    ("carl\tm\t5\nanna\tf\t3.5\nben\tm\t4", "", "anna"),
+    ("carl\tm\t5\nanna\tf\t3.5\nben\tm\t4", "sex", "carl"),
+    ("Specimen\tweight\tsex\nCARL.ply\t5\tm\nanna\t3,5\tf\nben\t4\tm", "", "ben"),
+    ("weight\tname\tsex\n5\tcarl\tm\n3.5\tanna\tf\n4\tben\tm", "weight", "anna"),
+])  # fmt: skip
+def test_rows_that_name_their_specimens_go_to_these_from_any_order_and_cell(
+    weighed: Project, text: str, column: str, at: str
+) -> None:
+    matched = match(weighed, text, column, at)
+    assert matched.by_name and matched.certain and matched.cells == RIGHT and matched.notes == ()
+    edit(weighed, what="block", columns=matched.columns, cells=matched.cells)
+    assert {one.id: one.cells for one in weighed.state.specimens} == RIGHT
+
+
+def test_a_block_without_names_is_shown_before_it_is_pasted(weighed: Project) -> None:
+    matched = match(weighed, "3.5\n4\n\n6", "weight", "anna")
+    assert not matched.by_name and not matched.certain
+    assert matched.cells == {"anna": {"weight": "3.5"}, "ben": {"weight": "4"}, "carl": {"weight": ""}}
+    assert matched.notes == ("1 row is not pasted, beyond the last row of the table.",)
+    matched = match(weighed, "f\t3\n\t\nm\t4", "sex", "anna")  # classes with a gap are no names
+    assert matched.cells["ben"] == {"sex": "", "weight": ""} and not matched.by_name and matched.notes == ()
+    assert match(weighed, "f\t3.5", "sex", "ben").certain  # one row, into the cell that was clicked
+    matched = match(weighed, "sex\tweight\nf\t3", "sex", "ben")
+    assert matched.cells == {"ben": {"sex": "f", "weight": "3"}} and "headings" in matched.notes[0]
+    assert match(weighed, "f\t3\t7\t8", "sex", "ben").notes == (
+        "2 columns are not pasted, beyond the last column of the table.",
+    )
+
+
+def test_numbers_that_are_also_names_of_specimens_are_values(tmp_path: Path) -> None:
+    project = Project.open(tmp_path / "p", create=True)
+    for k in range(1, 4):
+        project.add(tetrahedron(project.new_file(f"{k}.ply"), 1.0 + k), "training")
+    join_table(project, b"id,age,weight\n1,,\n")
+    matched = match(project, "3\t70\n1\t80", "age", "1")
+    assert not matched.by_name and matched.cells == {
+        "1": {"age": "3", "weight": "70"},
+        "2": {"age": "1", "weight": "80"},
+    }
+    matched = match(project, "3\t70\t80\n1\t71\t81", "", "1")
+    assert matched.by_name and matched.cells["3"] == {"age": "70", "weight": "80"}
+
+
+def test_rows_without_a_specimen_and_new_columns_are_shown_before_a_block_is_pasted(weighed: Project) -> None:
+    matched = match(weighed, "anna\tf\nnobody\tm", "sex")
+    assert not matched.certain and matched.cells == {"anna": {"sex": "f"}} and "nobody" in matched.notes[0]
+    matched = match(weighed, "Skull\tsex\tSite\nben\tm\tnorth\nanna\tf\tsouth\ncarl\tm\tnorth")
+    assert matched.by_name and not matched.certain and matched.columns == ("Site",)
+    edit(weighed, what="block", columns=matched.columns, cells=matched.cells)
+    assert weighed.state.columns == ("sex", "weight", "Site")
+    assert weighed.state.specimens[0].cells == {"sex": "f", "weight": "", "Site": "south"}
+    weighed.undo(weighed.revision)
+    assert weighed.state.columns == ("sex", "weight")
+    for text, error in (
+        ("anna\tf\nANNA\tm", "are of one specimen"),
+        ("x\tf\ny\tm", "contains no specimen of The pasted block"),
+        ("f\nm", "paste it into the column"),
+    ):
+        with pytest.raises((InputError, FileFormatError), match=error):
+            match(weighed, text)
+
+
+def test_a_cell_that_another_tab_changed_while_it_was_typed_is_not_overwritten(weighed: Project) -> None:
+    cell = {"id": "ben", "column": "sex", "value": "m", "before": ""}
+    edit(weighed, what="cells", cells=[{**cell, "value": "f"}])
+    with pytest.raises(StaleError, match="Another tab changed sex of ben to 'f'"):
+        edit(weighed, what="cells", cells=[cell])
+    edit(weighed, what="cells", cells=[{**cell, "before": "f"}])
+    assert weighed.state.specimens[1].cells["sex"] == "m"
 
 
 def test_scans_in_another_unit_or_mirrored_are_written_in_mm_for_the_commands(

@@ -7,6 +7,7 @@
   const T = window.ShapespaceTexts;
   const J = T.jobs;
   const { Button, CopyButton } = Studio;
+  const SHORT_HELP = 100; // characters, about two lines
   const CHECK_AFTER = 400; // ms without a change of the form
 
   const duration = (seconds) => seconds < 90 ? J.seconds(Math.max(1, Math.round(seconds))) : seconds < 5400 ? J.minutes(Math.round(seconds / 60)) : J.hours((seconds / 3600).toFixed(1));
@@ -39,6 +40,14 @@
   /** The classes that are counted, as `column=value`. */
   const classesOf = ({ counts }) => Object.entries(counts).flatMap(([column, classes]) => Object.keys(classes).filter(Boolean).map((value) => `${column}=${value}`));
 
+  /** A help text; what follows its first clause unfolds by a click, not by the focus, which would move a button under the pointer. */
+  function Help({ id, text }) {
+    const end = text.length > SHORT_HELP ? text.search(/[;.] /) : -1;
+    if (end < 0) return html`<small class="hint" id=${id}>${text}</small>`;
+    const rest = text.slice(end + 2).trim();
+    return html`<details class="hint" id=${id}><summary>${text.slice(0, end)}</summary>${rest[0].toUpperCase()}${rest.slice(1)}</details>`;
+  }
+
   function Option({ option, value, columns, onvalue }) {
     const { flag, kind, choices, initial, required } = option;
     const words = flag.replace(/^--/, "").replace(/-/g, " ");
@@ -47,16 +56,16 @@
     const common = { "data-testid": `option${flag}`, "aria-describedby": `help${flag}`, required };
     // The field shows the default already.
     const text = option.help.replace(/\s*\(default: [^()]*\)\s*$/, "");
-    const help = html`<small class="hint" id=${`help${flag}`} title=${text}>${text}</small>`;
+    const help = html`<${Help} id=${`help${flag}`} text=${text} />`;
     if (kind === "formula") return html`<${Formula} option=${option} value=${value || ""} columns=${columns} onvalue=${onvalue} />`;
     if (kind === "flag") return html`<div class="option"><label class="check"><input type="checkbox" ...${common} checked=${value === true} onchange=${(event) => onvalue(event.target.checked)} />${name}</label>${help}</div>`;
     if (kind === "choice" || kind === "column" || kind === "class") {
       const values = kind === "choice" ? choices : kind === "column" ? columns : classesOf(Studio.state.project);
-      return html`<label class="option">${label}<select ...${common} value=${value || ""} onchange=${(event) => onvalue(event.target.value)}>
+      return html`<div class="option"><label>${label}<select ...${common} value=${value || ""} onchange=${(event) => onvalue(event.target.value)}>
         ${!(initial && values.includes(initial)) && html`<option value="">${required ? "" : kind === "choice" ? J.default : J.none}</option>`}
-        ${values.map((one) => html`<option key=${one} value=${one} selected=${one === value}>${one}</option>`)}</select>${help}</label>`;
+        ${values.map((one) => html`<option key=${one} value=${one} selected=${one === value}>${one}</option>`)}</select></label>${help}</div>`;
     }
-    return html`<label class="option">${label}<input ...${common} inputmode=${kind === "number" ? "decimal" : undefined} value=${value || ""} placeholder=${initial || required ? "" : J.default} oninput=${(event) => onvalue(event.target.value)} />${help}</label>`;
+    return html`<div class="option"><label>${label}<input ...${common} inputmode=${kind === "number" ? "decimal" : undefined} value=${value || ""} placeholder=${initial || required ? "" : J.default} oninput=${(event) => onvalue(event.target.value)} /></label>${help}</div>`;
   }
 
   /** The options that differ from the initial ones. */
@@ -112,9 +121,9 @@
         ${form.options.filter((option) => option.visible).map(show)}
         ${folded.length > 0 && html`<details data-testid="more-options"><summary>${J.more(folded.length)}</summary>${folded.map(show)}</details>`}
         ${children}
-        ${checked && html`<div class="checks" role="status" aria-label=${T.questions.checks} data-testid="checks">
-          ${checks === null ? html`<p class="hint">${T.questions.checking}</p>` : checks.map((check) => html`<p class=${check.level}><b>${T.questions.levels[check.level]}</b> ${check.text}</p>`)}</div>`}
         <button class=${strong ? "strong wide" : "wide"} data-testid=${`run-${kind}`} disabled=${disabled || starting || missing || problem}>${word}</button>
+        ${/* Below the button, which they must not move while it is pressed. */ checked && html`<div class="checks" role="status" aria-label=${T.questions.checks} data-testid="checks">
+          ${checks === null ? html`<p class="hint">${T.questions.checking}</p>` : checks.map((check) => html`<p class=${check.level}><b>${T.questions.levels[check.level]}</b> ${check.text}</p>`)}</div>`}
       </form>`;
   }
 

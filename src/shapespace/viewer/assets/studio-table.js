@@ -3,10 +3,12 @@
   "use strict";
 
   const { html, useState, useMemo, useRef, useEffect } = window.Preact;
+  const Viewer = window.ShapespaceViewer;
   const Studio = window.ShapespaceStudio;
   const T = window.ShapespaceTexts;
   const S = T.specimens;
-  const { Button, Confirm } = Studio;
+  const { Button, Confirm, Dialog } = Studio;
+  const MOST_PREVIEWED = 100; // rows of a pasted block that are shown before it is pasted
 
   /** Move to the cell `down` rows and `right` columns from `input`. */
   function move(input, down, right) {
@@ -23,11 +25,12 @@
   function Cell({ value, label, testid, row, column, onedit, onblock }) {
     const [draft, setDraft] = useState(null);
     const current = useRef(null); // the draft at once, as a key may follow before the next drawing
-    const set = (text) => { current.current = text; setDraft(text); };
+    const before = useRef(value); // the text that the user began to edit; another tab may change it in the meantime
+    const set = (text) => { if (current.current === null) before.current = value; current.current = text; setDraft(text); };
     const send = async () => {
       const text = current.current;
       if (text === null) return;
-      if (text.trim() !== value) await onedit(text.trim());
+      if (text.trim() !== value || value !== before.current) await onedit(text.trim(), before.current);
       if (current.current === text) set(null);
     };
     const key = (event) => {
@@ -63,9 +66,9 @@
         <td class="tick"><input type="checkbox" checked=${selected} aria-label=${S.selectOne(specimen.id)} data-testid=${`select-${specimen.id}`} onclick=${(event) => onselect(specimen.id, event)} /></td>
         <td class="tick"><${Studio.Include} specimen=${specimen} /></td>
         <${Cell} value=${specimen.id} label=${S.rename(specimen.id)} testid=${`cell-${specimen.id}-id`} row=${row} column=${0}
-          onedit=${(to) => to && Studio.edit({ what: "rename", id: specimen.id, to })} />
+          onedit=${(to) => to && Studio.edit({ what: "rename", id: specimen.id, to })} onblock=${(rows) => onblock(specimen.id, "", rows)} />
         ${columns.map((name, k) => html`<${Cell} key=${name} value=${specimen.cells[name] || ""} label=${S.cell(name, specimen.id)} testid=${`cell-${specimen.id}-${name}`} row=${row} column=${k + 1}
-          onedit=${(value) => Studio.edit({ what: "cells", cells: [{ id: specimen.id, column: name, value }] })} onblock=${(rows) => onblock(specimen.id, k, rows)} />`)}
+          onedit=${(value, before) => Studio.edit({ what: "cells", cells: [{ id: specimen.id, column: name, value, before }] })} onblock=${(rows) => onblock(specimen.id, name, rows)} />`)}
         <td>${specimen.set === "new" ? S.new : S.training}</td>
         <td><${Studio.Unit} aria-label=${S.unitOf(specimen.id)} data-testid=${`unit-${specimen.id}`} disabled=${Studio.state.read_only} value=${specimen.unit} onunit=${(select) => setUnit(specimen, select)} /></td>
         <td class="tick"><input type="checkbox" checked=${specimen.mirrored} aria-label=${S.mirrorOne(specimen.id)} data-testid=${`mirror-${specimen.id}`} disabled=${Studio.state.read_only} onchange=${(event) => setMirror(specimen, event.target)} /></td>
@@ -90,19 +93,36 @@
 
   Studio.AddColumn = AddColumn;
 
+  /** The specimens and cells of a pasted block, before it is pasted. */
+  function Preview({ match, onclose }) {
+    const columns = [...new Set(Object.values(match.cells).flatMap(Object.keys))], rows = Object.entries(match.cells);
+    const paste = async () => { if (await Studio.edit({ what: "block", columns: match.columns, cells: match.cells })) onclose(); };
+    return html`
+      <${Dialog} title=${S.paste.title(rows.length)} testid="paste" onclose=${onclose} wide>
+        <p>${match.by_name ? S.paste.byName : S.paste.byPosition}</p>
+        ${match.columns.length > 0 && html`<p>${S.paste.columns(match.columns)}</p>`}
+        ${match.notes.length > 0 && html`<ul data-testid="paste-notes">${match.notes.map((note) => html`<li>${note}</li>`)}</ul>`}
+        <div class="table-box preview" role="region" aria-label=${S.paste.title(rows.length)} tabindex="0"><table class="plain">
+          <thead><tr><th scope="col">${S.columns.id}</th>${columns.map((name) => html`<th scope="col">${name}</th>`)}</tr></thead>
+          <tbody>${rows.slice(0, MOST_PREVIEWED).map(([id, cells]) => html`<tr key=${id}><th scope="row">${id}</th>${columns.map((name) => html`<td>${cells[name]}</td>`)}</tr>`)}</tbody></table></div>
+        ${rows.length > MOST_PREVIEWED && html`<p class="hint">${S.more(rows.length - MOST_PREVIEWED)}</p>`}
+        <div class="row end"><${Button} testid="paste-cancel" onclick=${onclose}>${T.cancel}<//>
+          <${Button} strong testid="paste-yes" disabled=${!rows.length} onclick=${paste}>${S.paste.action}<//></div>
+      <//>`;
+  }
+
   /** A table of `listed`; pasted blocks go on to specimens that are not shown yet. */
   Studio.Table = function Table({ listed, shown, columns, selection, onselect, onselectall }) {
     const [removing, setRemoving] = useState(null);
+    const [pasting, setPasting] = useState(null);
     const order = useRef(listed);
     order.current = listed;
-    const onblock = useMemo(() => (id, first, rows) => {
-      const from = order.current.findIndex((one) => one.id === id), cells = [];
-      rows.forEach((row, down) => row.forEach((value, right) => {
-        const specimen = order.current[from + down], column = columns[first + right];
-        if (specimen && column !== undefined) cells.push({ id: specimen.id, column, value: value.trim() });
-      }));
-      if (cells.length) Studio.edit({ what: "cells", cells });
-    }, [columns]);
+    const onblock = useMemo(() => Viewer.guarded(async (id, column, rows) => {
+      const from = order.current.findIndex((one) => one.id === id);
+      const match = await Studio.post("/api/paste", { rows, column, order: order.current.slice(from).map((one) => one.id) });
+      if (match.certain) await Studio.edit({ what: "block", columns: match.columns, cells: match.cells });
+      else setPasting(match);
+    }), []);
     const all = listed.length > 0 && listed.every((one) => selection.has(one.id));
     return html`
       ${!Studio.state.read_only && html`<p class="hint">${S.pasteHint}</p>`}
@@ -120,6 +140,7 @@
           <tbody>${shown.map((specimen, row) => html`<${Row} key=${specimen.id} specimen=${specimen} row=${row} columns=${columns} selected=${selection.has(specimen.id)} onselect=${onselect} onblock=${onblock} />`)}</tbody>
         </table>
       </div>
+      ${pasting !== null && html`<${Preview} match=${pasting} onclose=${() => setPasting(null)} />`}
       ${removing !== null && html`<${Confirm} title=${S.removeColumnTitle(removing)} text=${S.removeColumnText} action=${S.remove} onclose=${() => setRemoving(null)}
         onyes=${() => Studio.edit({ what: "remove-column", column: removing })} />`}`;
   };

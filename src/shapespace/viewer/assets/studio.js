@@ -7,6 +7,7 @@
   const Studio = window.ShapespaceStudio;
   const T = window.ShapespaceTexts;
   const { Button, Start, moveFocus } = Studio;
+  const LONGEST_PRESS = 2000; // ms, as some controls of the browser report no release
   const SCREENS = {
     specimens: Studio.Specimens, correspondence: Studio.Correspondence, model: Studio.Model, fit: Studio.Fit,
     questions: Studio.Questions, export: Studio.Export, history: Studio.History,
@@ -76,8 +77,17 @@
     if (event.shiftKey || event.key.toLowerCase() === "y") { if (project.redo) Studio.redo(); } else if (project.undo) Studio.undo();
   }
 
+  /** Draw when the pointer is up, so that nothing moves under it between press and release. */
+  function startDrawing() {
+    let pressed = null, late = false;
+    const release = () => { clearTimeout(pressed); pressed = null; if (late) setTimeout(() => { late = false; draw(); }); }; // after the click
+    addEventListener("pointerdown", () => { clearTimeout(pressed); pressed = setTimeout(release, LONGEST_PRESS); }, true);
+    for (const kind of ["pointerup", "pointercancel"]) addEventListener(kind, release, true);
+    Studio.changed = () => { if (pressed !== null) late = true; else draw(); };
+  }
+
   async function start() {
-    Studio.changed = draw;
+    startDrawing();
     Viewer.startMessages();
     Viewer.startTheme(() => {
       // Pages in frames take the theme when they are loaded; their own button, which is hidden there, switches it later.

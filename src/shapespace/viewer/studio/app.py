@@ -12,6 +12,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
 
+from msgspec import to_builtins
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
@@ -24,6 +25,7 @@ from shapespace.errors import FileError, InputError
 from shapespace.io.containers.json_files import plain_json
 from shapespace.io.files import atomic_path
 from shapespace.io.meshes.mesh_io import MESH_ENDINGS, MESH_FILE_ENDINGS
+from shapespace.schemas import read
 from shapespace.types import MM_PER_UNIT
 from shapespace.version import __version__
 from shapespace.viewer.guard import Access, Guard, refusal
@@ -40,6 +42,7 @@ from shapespace.viewer.server import (
 from shapespace.viewer.studio.job_commands import QUESTIONS, Forms, checks, order, shapes_of
 from shapespace.viewer.studio.jobs import Job, Jobs, Order, history
 from shapespace.viewer.studio.project import (
+    PastedBlock,
     Project,
     Role,
     StaleError,
@@ -186,6 +189,7 @@ class Studio:
             Route("/api/undo", self._undo, methods=["POST"]),
             Route("/api/redo", self._redo, methods=["POST"]),
             Route("/api/table", self._table, methods=["POST"]),
+            Route("/api/paste", self._match_block, methods=["POST"]),
             Route("/api/checks", self._check, methods=["POST"]),
             Route("/api/jobs", self._add_job, methods=["POST"]),
             Route(f"{job}/cancel", self._cancel, methods=["POST"]),
@@ -324,7 +328,7 @@ class Studio:
         raise HTTPException(404, "There is no picture of this specimen.")
 
     async def _edit(self, request: Request) -> Response:
-        content = await json_body(request, _REQUEST_BYTES)
+        content = await json_body(request, _TABLE_BYTES)
         return self._apply_edit(lambda: self._project.project.edit(_revision(content), change_of(content)))
 
     async def _undo(self, request: Request) -> Response:
@@ -351,6 +355,11 @@ class Studio:
         await run_in_threadpool(project.edit, None, with_cells(columns, cells))
         self._changed()
         return json_response({"matched": len(cells), "notes": [*notes, *project.state.notes()]})
+
+    async def _match_block(self, request: Request) -> Response:
+        content = await json_body(request, _TABLE_BYTES)
+        block = read(PastedBlock, content, "The pasted block", "copy the cells again")
+        return json_response(to_builtins(await run_in_threadpool(block.match, self._project.project.state)))
 
     # Jobs
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import filecmp
+import io
 import json
 import re
 import threading
@@ -17,12 +19,12 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from shapespace.batch.result_folder import names_for
-from shapespace.cohort.table import match_rows, names_of_file, notes_on_classes, read_table
+from shapespace.cohort.table import fold_name, is_number, match_rows, names_of_file, notes_on_classes, read_table
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.containers.json_files import read_json
 from shapespace.io.files import atomic_path, make_folder, write_error, write_text
 from shapespace.io.meshes.mesh_io import MESH_FILE_ENDINGS, mesh_files, stem_of
-from shapespace.io.tables.table_io import key_column, table_text
+from shapespace.io.tables.table_io import KEYS, key_column, table_text
 from shapespace.schemas import json_text, read
 from shapespace.types import MM_PER_UNIT
 
@@ -369,6 +371,98 @@ class Project:
         write_text(path, table_text(header, rows))
 
 
+class MatchedBlock(Struct, frozen=True, kw_only=True):
+    """The cells that a pasted block would change.
+
+    Args:
+        columns: columns that are added to the table.
+        cells: id -> column -> value.
+        by_name: whether the rows name their specimens; otherwise they follow the order of the page.
+        certain: whether it can be pasted without a question.
+        notes: sentences on rows and columns that are not pasted, and on specimens without a row.
+    """
+
+    columns: tuple[str, ...] = ()
+    cells: dict[str, dict[str, str]]
+    by_name: bool
+    certain: bool
+    notes: tuple[str, ...]
+
+
+class PastedBlock(Struct, frozen=True, kw_only=True):
+    """Cells that are pasted from a spreadsheet into the table.
+
+    Args:
+        rows: rows of cells; short rows lack their last cells.
+        column: column of the cell into which they are pasted; empty for the names of the specimens.
+        order: ids of the specimens from the row of this cell on, in the order of the page.
+    """
+
+    rows: tuple[tuple[str, ...], ...]
+    column: str
+    order: tuple[str, ...]
+
+    def match(self, state: State) -> MatchedBlock:
+        """Return the cells that the block would change: by the names in its first column, or else by position.
+
+        A first row with the heading of a column of names, or with the headings of the columns that it is pasted into,
+        is a header. Names are matched as in tables that are imported.
+
+        Raises:
+            FileFormatError: two rows are of one specimen.
+            InputError: there are no rows, or names are expected, as the block is pasted into the column of names or has
+                a heading of names, and no row names a specimen.
+        """
+        width = max(map(len, self.rows), default=0)
+        if not width:
+            raise InputError("The pasted block has no cells; copy cells of a spreadsheet.")
+        rows = [[*map(str.strip, row), *[""] * (width - len(row))] for row in self.rows]
+        columns = list(state.columns[state.columns.index(self.column) :] if self.column in state.columns else ())
+        has_heading = key_column(rows[0]) is not None
+        if width == 1 and not self.column:
+            raise InputError("The pasted block has one column; paste it into the column that it belongs to.")
+        known = {
+            fold_name(name)
+            for specimen in state.specimens
+            for name in (specimen.id, *names_of_file(Path(specimen.file).name))
+        }
+        named = [fold_name(row[0].replace("\\", "/").rpartition("/")[2]) in known for row in rows]
+        has_names = any(name and not is_number(row[0]) for name, row in zip(named, rows, strict=True))
+        if not has_heading and self.column and not (has_names and width > 1):
+            return self._by_position(rows, columns)
+        heads = rows[0][1:]
+        is_new = not self.column and not named[0] and any(named) and not any(map(is_number, heads))
+        has_heads = all(heads) and len(set(heads)) == len(heads) and (is_new or set(heads) <= set(state.columns))
+        header = rows.pop(0) if has_heading or has_heads else ["", *(columns if self.column else state.columns)]
+        return self._by_name(header if has_heading else [KEYS[0], *header[1:]], rows, state, is_sure=has_heading)
+
+    def _by_name(self, header: list[str], rows: list[list[str]], state: State, *, is_sure: bool) -> MatchedBlock:
+        width = max(map(len, self.rows))
+        text = io.StringIO()
+        csv.writer(text, delimiter="\t").writerows([header[:width], *(row[: len(header)] for row in rows)])
+        pasted, cells, notes = cells_of_table(text.getvalue().encode(), state, "The pasted block")
+        new = tuple(column for column in pasted if column not in state.columns)
+        notes += _beyond(width - len(header), "column")
+        return MatchedBlock(
+            columns=new, cells=cells, by_name=True, certain=not notes and (is_sure or not new), notes=tuple(notes)
+        )
+
+    def _by_position(self, rows: list[list[str]], columns: list[str]) -> MatchedBlock:
+        notes: list[str] = []
+        if rows[0] == columns[: len(rows[0])] and len(rows) > 1:
+            notes.append("The first row contains the headings of these columns, and is not pasted.")
+            rows = rows[1:]
+        notes += [*_beyond(len(rows) - len(self.order), "row"), *_beyond(len(rows[0]) - len(columns), "column")]
+        cells = {name: dict(zip(columns, row, strict=False)) for name, row in zip(self.order, rows, strict=False)}
+        return MatchedBlock(cells=cells, by_name=False, certain=not notes and len(rows) == 1, notes=tuple(notes))
+
+
+def _beyond(count: int, noun: str) -> list[str]:
+    """Return a sentence on the rows or columns of a block that lie beyond those of the table; none if none do."""
+    number = f"1 {noun} is" if count == 1 else f"{count} {noun}s are"
+    return [f"{number} not pasted, beyond the last {noun} of the table."] if count > 0 else []
+
+
 class StaleError(InputError):
     """The project was changed after the user looked at it."""
 
@@ -381,9 +475,9 @@ def change_of(request: Mapping[str, Any]) -> Callable[[State], tuple[str, State]
     """
     what = str(request.get("what", ""))
     edits = {
-        "cells": _edit_cells, "include": _include, "set": _set_role, "remove": _remove, "rename": _rename,
-        "unit": _set_unit, "mirror": _mirror, "add-column": _add_column, "remove-column": _remove_column,
-        "landmarks": _set_landmarks,
+        "cells": _edit_cells, "block": _edit_block, "include": _include, "set": _set_role, "remove": _remove,
+        "rename": _rename, "unit": _set_unit, "mirror": _mirror, "add-column": _add_column,
+        "remove-column": _remove_column, "landmarks": _set_landmarks,
     }  # fmt: skip
 
     def change(state: State) -> tuple[str, State]:
@@ -399,14 +493,33 @@ def change_of(request: Mapping[str, Any]) -> Callable[[State], tuple[str, State]
 
 def _edit_cells(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
     by_id: dict[str, dict[str, str]] = {}
+    stored = {specimen.id: specimen.cells for specimen in state.specimens}
     for cell in request["cells"]:
         _check_column(state, cell["column"])
         by_id.setdefault(cell["id"], {})[cell["column"]] = str(cell["value"]).strip()[:_LONGEST_CELL]
+        now = stored.get(cell["id"], {}).get(cell["column"], "")
+        if now != cell.get("before", now):
+            raise StaleError(
+                f"Another tab changed {cell['column']} of {cell['id']} to {now[:40]!r} in the meantime; look at it, "
+                "and edit it again if it is wrong."
+            )
     edited = _edit_specimens(
         state, by_id, lambda specimen: replace(specimen, cells={**specimen.cells, **by_id[specimen.id]})
     )
     count = sum(map(len, by_id.values()))
     return f"edit {count} cell{'' if count == 1 else 's'}", edited
+
+
+def _edit_block(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
+    cells = {
+        str(name): {str(column): str(value).strip()[:_LONGEST_CELL] for column, value in own.items()}
+        for name, own in request["cells"].items()
+    }
+    for column in request["columns"]:
+        _, state = _add_column(state, {"column": column})
+    for column in {column for own in cells.values() for column in own}:
+        _check_column(state, column)
+    return with_cells((), cells)(state)
 
 
 def _include(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
