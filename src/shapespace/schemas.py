@@ -639,6 +639,8 @@ class Quality(Struct, frozen=True, kw_only=True):
     were measured on the same shapes and folds; their `differences` are relative to this model.
     """
 
+    FILE: ClassVar = "quality.json"
+
     name: str = ""
     compactness: tuple[float, ...] | Measured | None = None
     generalisation: tuple[float, ...] | Measured | None = None

@@ -12,16 +12,20 @@ from msgspec import structs
 from report_page import Page, edit
 
 from same_blobs import ASIDE, EVIL, FAR, FOLDED, HIDDEN, NAMES, VERTICES, mean_blob, surface, write_records, write_same
+from shapespace.cohort.cohort import Cohort
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
+from shapespace.io.tables.table_io import write_rows
+from shapespace.report.analyses.morphospace_report import morphospace_report
 from shapespace.report.figures import analysis_figures as correspondence_figures
 from shapespace.report.inputs.correspondence_folder import Corresponded, concerns_of, upright
 from shapespace.report.pages import correspondence_page
-from shapespace.report.pages.write_html import LARGEST_REPORT_BYTES, write_report
+from shapespace.report.pages.write_html import LARGEST_REPORT_BYTES, write_report, write_study_report
 from shapespace.report.render.renderer import Camera, Layer, render, squares
 from shapespace.report.render.thumbnails import checker_layer, checker_places
+from shapespace.statistics.shape_tests.ordination import ordinate
 from shapespace.types import Mesh
-from synthetic_shapes import similarity
+from synthetic_shapes import blob_model, similarity
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +62,29 @@ def test_every_part_is_there_in_order_and_none_is_broken(page: str) -> None:
     assert at == sorted(at)
     levels = [int(tag[1]) for tag, _ in Page(page).tags if re.fullmatch("h[1-6]", tag)]
     assert all(after <= before + 1 for before, after in itertools.pairwise(levels))
+
+
+def test_a_report_of_a_study_has_a_chapter_for_each_result(template: Path, tmp_path: Path) -> None:
+    blob_model(200, 3).save(tmp_path / "model.h5")
+    planar = Cohort.of_shapes(np.random.default_rng(3).normal(size=(6, 5, 3)), {"kind": ["a", "b"] * 3}, unit="")
+    answer = morphospace_report(ordinate(planar, group=("kind",)))
+    answer.save(tmp_path / "morphospace")
+    write_rows(tmp_path / "table.csv", ("specimen", "sex"), [(name, "fm"[k % 2]) for k, name in enumerate(NAMES)])
+    results = [template, tmp_path / "model.h5", tmp_path / "morphospace"]
+    page = write_study_report(results, tmp_path / "r.html", specimens=tmp_path / "table.csv").read_text("utf-8")
+    assert "This part could not be made" not in page and EVIL not in page
+    seen = Page(page)
+    chapters = ["Specimens", "Answers", "Correspondence of 7 scans in same", "The same places on every scan"]
+    chapters += ["Model in model.h5", answer.title, "Scree plot"]
+    at = [seen.headings.index(text) for text in [f"Study of {len(NAMES)} specimens", *chapters]]
+    assert at == sorted(at)
+    assert all(sentence in seen.words for sentence in answer.summary)
+    levels = [int(tag[1]) for tag, _ in seen.tags if re.fullmatch("h[1-6]", tag)]
+    assert all(after <= before + 1 for before, after in itertools.pairwise(levels))
+    places = [attributes["id"] for _, attributes in seen.tags if "id" in attributes]
+    assert len(set(places)) == len(places) and len(page) < LARGEST_REPORT_BYTES
+    with pytest.raises(FileError, match="nothing"):
+        write_study_report([template, tmp_path / "nothing"], tmp_path / "r.html")
 
 
 def test_the_first_sentences_say_whether_to_go_on(page: str) -> None:

@@ -301,6 +301,26 @@ def test_a_project_is_not_created_among_other_files(tmp_path: Path) -> None:
         Project.open(tmp_path)
 
 
+def test_the_report_of_the_study_has_the_newest_of_each_step_and_each_answer_once(project: Project) -> None:
+    def job(number: int, kind: str, output: str, status: str = "done", **more: Any) -> Job:
+        return Job(number=number, kind=kind, arguments=(kind,), output=output, status=status, **more)
+
+    sex, age = {"options": {"--formula": "~ sex"}, "on": 1}, {"options": {"--formula": "~ age"}, "on": 1}
+    jobs = [
+        job(1, "correspond", "correspondence-1"), job(2, "build", "model-2.h5"), job(3, "compare", "compare-3", **sex),
+        job(4, "redo", "correspondence-1"), job(5, "build", "model-5.h5"), job(6, "compare", "compare-6", **age),
+        job(7, "compare", "compare-7", **sex), job(8, "morphospace", "morphospace-8"),
+        job(9, "asymmetry", "asymmetry-9", "failed"), job(10, "report", "report-10/report.html"),
+    ]  # fmt: skip
+    made = order(project, jobs, forms(summaries_and_options()), "report", {}, None, 11)
+    assert made.arguments == (
+        "report", "correspondence-1", "model-5.h5", "morphospace-8", "compare-6", "compare-7",
+        "--specimens", "inputs/0011.csv", "-o", "report-11/report.html", "--no-open",
+    )  # fmt: skip
+    with pytest.raises(InputError, match="no results yet"):
+        order(project, jobs[-2:], forms(summaries_and_options()), "report", {}, None, 11)
+
+
 @pytest.mark.parametrize("kind", sorted(forms(summaries_and_options())))
 def test_each_action_is_a_command_line_that_the_parser_takes(project: Project, tmp_path: Path, kind: str) -> None:
     for k, name in enumerate(("dora", "emil")):

@@ -591,12 +591,17 @@ COMMANDS: tuple[CommandSpec, ...] = (
         settings=(_LANDMARK_STDDEV, setting("seed", "S", source=COMPLETION, parse=values.natural)),
     ),
     CommandSpec(
-        "report", "write one HTML report of the fits, correspondence or study in a folder",
-        ("shapespace fit model.h5 scans -o out --stages", "shapespace report out"), "commands.answers:report",
+        "report", "write one HTML report of results: of a folder, or of a whole study",
+        ("shapespace fit model.h5 scans -o out --stages", "shapespace report out",
+         "shapespace report corresponding model.h5 groups --specimens table.csv -o study.html"),
+        "commands.answers:report",
         (
-            basic("folder", "DIR", "written by shapespace fit, correspond, recognise study or demo", parse=Path),
-            basic("-o --output", "FILE.html", "the report (default: DIR/report.html)", parse=Path),
-            basic("--labels", "FILE", "table of scans and labels (default: labels.csv in DIR or next to the scans)",
+            basic("results", "RESULT", "a folder that shapespace wrote, such as fits, a correspondence or an analysis; "
+                  "several, also models, become the chapters of one report", nargs="+", parse=Path),
+            basic("-o --output", "FILE.html", "the report (default: RESULT/report.html)", parse=Path),
+            basic("--specimens", "TABLE", "table of the specimens, the first chapter of a report on several results",
+                  parse=Path),
+            basic("--labels", "FILE", "table of scans and labels (default: labels.csv in RESULT or next to the scans)",
                   parse=Path),
             basic("--no-open", help="do not open the report in a browser"),
             _MODEL_OF_FITS,

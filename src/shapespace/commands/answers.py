@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 from shapespace.batch.progress import progress, waiting
 from shapespace.commands.outcome import Outcome
-from shapespace.errors import ShapespaceError
+from shapespace.errors import InputError, ShapespaceError
 from shapespace.report.analyses.analysis_report import AnalysisReport
 from shapespace.schemas import to_json
 
@@ -43,14 +43,26 @@ def write_answer(report: AnalysisReport, output: Path, *, quiet: bool) -> Outcom
 
 
 def report(
-    folder: Path, output: Path | None, *, model: Path | None, labels: Path | None, no_open: bool, quiet: bool
-) -> Outcome:
-    """Write the report on the results in `folder`, and open it.
+    results: Sequence[Path], output: Path | None, *, specimens: Path | None, model: Path | None, labels: Path | None,
+    no_open: bool, quiet: bool,
+) -> Outcome:  # fmt: skip
+    """Write the report on a folder of results, or on several results, and open it.
 
     Raises:
+        InputError: options of one folder for several results, or no file for their report.
         FileError, InputError, ShapespaceError: as for `write_report`.
     """
-    page = write_report(folder, output, model=model, labels=labels, quiet=quiet)
+    from shapespace.report.pages.write_html import write_study_report
+
+    if len(results) == 1 and specimens is None and results[0].suffix != ".h5":
+        page = write_report(results[0], output, model=model, labels=labels, quiet=quiet)
+    elif model is not None or labels is not None:
+        raise InputError("--model and --labels are of one folder of fits; omit them, or give that folder alone.")
+    elif output is None:
+        raise InputError("Name the file of the report, such as -o report.html.")
+    else:
+        with drawing(quiet=quiet) as step:
+            page = write_study_report(results, output, specimens=specimens, on_step=step)
     facts = {"report": str(page), "bytes": page.stat().st_size}
     return Outcome(facts, [f"The report is {page}"], page=None if no_open else page)
 

@@ -49,11 +49,11 @@ from shapespace.report.blocks.wording import (
     training_text,
     words,
 )
-from shapespace.report.inputs.saved_fits import Direction, Measure, SavedFit, StagedFit, measured_mm
+from shapespace.report.inputs.saved_fits import Direction, Folder, Measure, SavedFit, StagedFit, measured_mm
 from shapespace.report.pages.page import Page
 from shapespace.report.render import thumbnails
 from shapespace.report.render.scene import pack_fit, pack_model, pack_scatter, pack_surfaces
-from shapespace.schemas import Quality, VertexErrors
+from shapespace.schemas import Quality, VertexErrors, read
 from shapespace.types import FloatArray, Mesh
 
 MODEL_PICTURES, FIT_PICTURES = 4, 9
@@ -154,8 +154,14 @@ def model_part(page: Page, model: ShapeModel, *, figure_of: str = "", to_move: i
     ]
 
 
-def quality_part(page: Page, quality: Quality) -> Figure:
-    """Return the quality of a shape space by its number of modes, from the measures that are present."""
+def quality_part(page: Page, folder: Folder) -> Figure:
+    """Return the quality of a shape space by its number of modes, from the measures that quality.json contains.
+
+    Raises:
+        FileError: the file cannot be read.
+        FileFormatError: it is damaged.
+    """
+    quality = read(Quality, folder.json(Quality.FILE), Quality.FILE, "measure it again")
     return page.figure(
         figures.quality_figure(quality),
         "Compactness: share of the variance. Generalisation: error on held-out shapes. Specificity: distance of random "

@@ -62,7 +62,7 @@ from shapespace.report.render import thumbnails
 from shapespace.report.render.palette import DIVERGING, SEQUENTIAL
 from shapespace.report.render.scene import decimate
 from shapespace.reprs import describe_groups, first_names
-from shapespace.schemas import CORRESPOND_AGAIN, CorrespondRecord, Quality, read
+from shapespace.schemas import CORRESPOND_AGAIN, CorrespondRecord, Quality
 from shapespace.types import FloatArray, Mesh
 from shapespace.version import __version__
 
@@ -139,8 +139,15 @@ class CorrespondencePage:
             Chapter("The rounds", self.rounds, "Rounds"),
             Chapter("Settings and hashes", self.settings, "Settings"),
         ]
-        if (self.result.root / "quality.json").is_file():
-            chapters.insert(4, Chapter("Quality of the shape space", self.quality, "Quality"))
+        if (self.result.root / Quality.FILE).is_file():
+            chapters.insert(
+                4,
+                Chapter(
+                    "Quality of the shape space",
+                    lambda: sections.quality_part(self.page, self.result.folder),
+                    "Quality",
+                ),
+            )
         return self.page.html(
             f"Correspondence of {counted(self.total, 'scan')} in {name}",
             [
@@ -544,14 +551,6 @@ class CorrespondencePage:
                 "Movement and time by round",
             ),
             Text("CPU seconds are those of the scans in correspondence; choosing the template is not counted.", "soft"),
-        ]
-
-    def quality(self) -> list[Block]:
-        """Return the figure of quality.json."""
-        return [
-            sections.quality_part(
-                self.page, read(Quality, self.result.folder.json("quality.json"), "quality.json", "measure it again")
-            )
         ]
 
     def settings(self) -> list[Block]:

@@ -69,7 +69,7 @@ from shapespace.report.inputs.saved_fits import (
 from shapespace.report.pages import study_page
 from shapespace.report.pages.page import Chapter, Page
 from shapespace.report.render import thumbnails
-from shapespace.schemas import Quality, read
+from shapespace.schemas import Quality
 from shapespace.store.results import Results
 from shapespace.types import FloatArray
 from shapespace.version import __version__
@@ -187,15 +187,9 @@ class FolderPage:
     def model_part(self) -> list[Block]:
         """Return the blocks of the model, with the figure of quality.json if there is such a file."""
         out = sections.model_part(self.page, self.model())
-        if (self.folder.root / "quality.json").is_file():
-            out += self.page.tried(self.quality)
+        if (self.folder.root / Quality.FILE).is_file():
+            out += self.page.tried(lambda: sections.quality_part(self.page, self.folder))
         return out
-
-    def quality(self) -> Block:
-        """Return the figure of quality.json."""
-        return sections.quality_part(
-            self.page, read(Quality, self.folder.json("quality.json"), "quality.json", "measure it again")
-        )
 
     def summary(self) -> list[Block]:
         """Return the numbers of fits by status, medians of the trusted fits, and the fits that need review."""

@@ -14,24 +14,35 @@ from typing import TYPE_CHECKING, Any
 from msgspec import structs
 
 from shapespace.cohort.orientation import find_orientation
+from shapespace.cohort.table import Table, read_table
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.io.files import make_folder, write_text
+from shapespace.model.shape_model import ShapeModel
 from shapespace.report import figures
-from shapespace.report.blocks.blocks import Block, Figure, Image, Section, Text, Turning
-from shapespace.report.blocks.wording import anchor
+from shapespace.report.blocks import sections
+from shapespace.report.blocks.blocks import Block, Figure, Image, Section, Text, Turning, text_table
+from shapespace.report.blocks.wording import anchor, counted, listed
 from shapespace.report.inputs.saved_fits import Folder, find_fits
 from shapespace.report.pages.correspondence_page import CorrespondencePage
 from shapespace.report.pages.demo_page import DemoPage
-from shapespace.report.pages.folder_page import FolderPage, ManyPage, is_many
+from shapespace.report.pages.folder_page import MOST_ROWS, FolderPage, ManyPage, is_many
 from shapespace.report.pages.page import LARGEST_REPORT_BYTES, Chapter, Make, Page, Step
 from shapespace.report.pages.study_page import ANALYSIS, standalone_file, study_page
-from shapespace.schemas import Analysis, CorrespondenceRecord, Orientation
+from shapespace.schemas import Analysis, CorrespondenceRecord, Orientation, Quality
 from shapespace.store.results import Results
+from shapespace.version import __version__
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing
 
-__all__ = ["LARGEST_REPORT_BYTES", "FigureConfig", "require_report_extra", "write_figures", "write_report"]
+__all__ = [
+    "LARGEST_REPORT_BYTES",
+    "FigureConfig",
+    "require_report_extra",
+    "write_figures",
+    "write_report",
+    "write_study_report",
+]
 
 FIGURES_FOLDER = "figures"
 """Folder of the figures in that of the results."""
@@ -39,6 +50,8 @@ _OWN_VIEWS = (
     "Named views are those of maps and morphs of analyses; pictures of fits and correspondences have their own."
 )
 _FORMATS = ("svg", "pdf", "png")
+_LONGEST_LINK = 36  # characters of a link to a chapter
+_MOST_CLASSES = 12  # classes of a column that are counted
 _LONGEST = 80  # characters of a file name, which file systems allow with any ending
 
 
@@ -112,6 +125,124 @@ def _html(folder: Folder, model: Path | None, labels: Path | None, page: Page) -
     if all(fit.status == "unreadable" for fit in fits):
         raise InputError(f"{root}: none of its {len(fits)} records can be read; {fits[0].reason}")
     return FolderPage(folder, fits, model=model, labels=labels, page=page).html()
+
+
+class _StudyPage(Page):
+    """Collects the reports of several results, each as a chapter of one page.
+
+    Args:
+        on_step: called after each picture.
+    """
+
+    def __init__(self, on_step: Step | None = None) -> None:
+        super().__init__(on_step)
+        self.chapters: list[Chapter] = []
+        self._is_inside = False
+
+    def section(self, heading: str, make: Make, level: int = 3, *args: Any, **options: Any) -> Section:
+        """Return a section, one level deeper inside a chapter."""
+        return super().section(heading, make, level + self._is_inside, *args, **options)
+
+    def html(self, title: str, lead: Sequence[Block], made: str, chapters: Sequence[Chapter]) -> str:
+        """Collect the report of a result."""
+
+        def make() -> list[Block]:
+            self._loaded.clear()  # each result has a model and fits of its own
+            self._is_inside = True
+            try:
+                return [*lead, *(self.section(chapter.heading, chapter.make, 2) for chapter in chapters)]
+            finally:
+                self._is_inside = False
+
+        self.chapters.append(
+            Chapter(title, make, title if len(title) <= _LONGEST_LINK else f"{title[:_LONGEST_LINK]}…")
+        )
+        return ""
+
+    def add(self, result: Path) -> None:
+        """Add the report of a result: of a folder, or of a model.
+
+        Raises:
+            FileError, InputError: as for `write_report`.
+        """
+        before = self.planned
+        if result.is_file():
+            model = ShapeModel.load(result)
+            self.chapters.append(Chapter(f"Model in {result.name}", lambda: sections.model_part(self, model)))
+            self.planned = sections.MODEL_PICTURES
+        elif (result / Quality.FILE).is_file() and not (result / CorrespondenceRecord.FILE).is_file():
+            folder = Folder(result)
+            self.chapters.append(Chapter("Quality of the shape space", lambda: sections.quality_part(self, folder)))
+        else:
+            _html(Folder(result), None, None, self)
+        self.planned += before
+
+    def study(self, results: Sequence[Path], specimens: Table | None) -> str:
+        """Return the page: specimens, answers in words, then each result."""
+        chapters = [] if specimens is None else [Chapter("Specimens", lambda: _specimen_blocks(specimens))]
+        answers = [
+            Analysis.from_json(Folder(result, ANALYSIS.again).json(Analysis.FILE))
+            for result in results
+            if (result / Analysis.FILE).is_file()
+        ]
+        rows = [
+            ("" if k else answer.title, sentence)
+            for answer in answers
+            for k, sentence in enumerate([answer.summary] if isinstance(answer.summary, str) else answer.summary)
+        ]
+        if rows:
+            chapters.append(
+                Chapter("Answers", lambda: text_table(("Question", "Answer"), rows, "The answers in words"))
+            )
+        title = counted(len(results), "result") if specimens is None else counted(len(specimens), "specimen")
+        names = listed([result.name for result in results])
+        return super().html(
+            f"Study of {title}", [], f"Made by shapespace {__version__} from {names}.", [*chapters, *self.chapters]
+        )
+
+
+def _specimen_blocks(specimens: Table) -> list[Block]:
+    """Return the number of specimens in each class, and the table of the specimens."""
+    counts = [
+        (column, "; ".join(f"{number} {name or 'not stated'}" for name, number in classes.items()))
+        for column, cells in specimens.columns.items()
+        if 0 < len(classes := Counter(cells)) <= _MOST_CLASSES and len(classes) < len(cells)
+    ]
+    rows = [
+        (name, *(cells[row] for cells in specimens.columns.values()))
+        for row, name in enumerate(specimens.rows[:MOST_ROWS])
+    ]
+    more = len(specimens) - len(rows)
+    return [
+        *([text_table(("Column", "Specimens in each class"), counts, "Classes")] if counts else []),
+        text_table(("Specimen", *specimens.columns), rows, "The specimens"),
+        Text(f"{counted(more, 'specimen is', 'specimens are')} not listed." if more else ""),
+    ]
+
+
+def write_study_report(
+    results: Sequence[Path], output: Path, *, specimens: Path | None = None, on_step: Step | None = None
+) -> Path:
+    """Write one HTML file on several results, each as a chapter, and return its path.
+
+    Args:
+        results: models, and folders of results of any kind that `write_report` reports or `quality` wrote, in the order
+            of the chapters.
+        output: file of the report.
+        specimens: table of the specimens, which becomes the first chapter.
+        on_step: called after each picture.
+
+    Raises:
+        FileError, InputError: as for `write_report`, of any result; or the table cannot be read.
+        ShapespaceError: the extra `report` is not installed.
+    """
+    require_report_extra()
+    page = _StudyPage(on_step)
+    table = None if specimens is None else read_table(specimens)
+    for result in results:
+        page.add(result)
+    write_text(output, page.study(results, table))
+    return output
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -34,7 +34,7 @@
         <td><${Files} job=${job} /></td>
         <td><div class="row">
           <a class="button" href=${`/zip/${job.number}`} download data-testid=${`zip-${job.number}`}>${T.export.zip}</a>
-          ${["correspond", "redo", "fit"].includes(job.kind) && html`<${Button} edits small testid=${`report-${job.number}`} onclick=${() => Studio.runJob("report", {}, job.number)}>${T.export.report}<//>`}
+          ${["correspond", "redo", "fit"].includes(job.kind) && html`<${Button} edits small testid=${`report-${job.number}`} onclick=${() => Studio.runJob("report", {}, job.number)}>${T.export.reportOf}<//>`}
           ${isQuestion && html`<${Button} edits small testid=${`figures-${job.number}`} onclick=${() => Studio.runFigures(job)}>${T.export.figures}<//>`}
           ${job.views.some((view) => view.kind === "report") && html`<a class="button" href=${`/view/${job.number}/`} target="_blank" rel="noopener" data-testid=${`open-${job.number}`}>${T.jobs.full}</a>`}
         </div></td>
@@ -43,12 +43,11 @@
 
   Studio.Export = function Export({ project }) {
     const done = project.jobs.filter((job) => job.status === "done").reverse();
-    const source = Studio.newest("fit", "correspond", "redo");
     const busy = Studio.jobsOf(["report"]).some(Studio.isActive);
     return html`
       <div class="fill scroll" data-testid="screen-export">
         <div class="row bar"><div><h2>${T.export.title}</h2><p class="hint">${T.export.intro}</p></div><span class="grow"></span>
-          <${Button} edits strong testid="write-report" disabled=${!source || busy} onclick=${() => Studio.runJob("report", {}, source.number)}>${T.export.report}<//></div>
+          <${Button} edits strong testid="write-report" disabled=${!done.length || busy} onclick=${() => Studio.runJob("report")}>${T.export.report}<//></div>
         <${Jobs} kinds=${["report", "convert", "export", "figures"]} />
         ${Studio.jobsOf(Studio.QUESTIONS).filter(Studio.isActive).map((job) => html`<${JobPanel} key=${job.number} job=${job} />`)}
         ${Studio.newest("build") && Studio.forms.convert && html`<details class="narrow" data-testid="convert"><summary>${T.export.convert}</summary><${JobForm} kind="convert" sources=${["build"]} /></details>`}

@@ -107,7 +107,7 @@
       empty: "After the run, the answer in words, the figures and the text for the paper are shown here.",
     },
     export: {
-      title: "Export", intro: "Download results, or write one report that opens in any browser.", report: "Write report", reportOf: "Report of", none: "There are no results yet.",
+      title: "Export", intro: "Download results, or write one report of the study that opens in any browser: specimens, correspondence, model, morphospace and each answer.", report: "Write report of the study", reportOf: "Write report of this", none: "There are no results yet.",
       files: "Files", size: "Size", zip: "Download all (ZIP)", figures: "Figures in SVG, PDF and PNG", convert: "Model in another format", noFiles: "No files.", show: "Files",
       result: "Result", actions: "Downloads", download: (path) => `Download ${path}`,
     },

@@ -16,6 +16,8 @@ Forms = Mapping[str, Mapping[str, Any]]
 
 QUESTIONS = ("compare", "change", "asymmetry", "regress", "score", "identify", "morphospace")
 CORRESPONDENCES = ("correspond", "redo")
+_STUDY = (*CORRESPONDENCES, "build", "quality", "morphospace", *QUESTIONS[:-1], "fit", "complete")
+"""Kinds of results in the report of the study, in the order of its chapters."""
 _INPUTS = "inputs"
 
 
@@ -74,6 +76,11 @@ def order(
         prepared = project.write_scans(folder / listed, chosen)
         output = f"{'fits' if kind == 'fit' else 'completed'}-{number}"
         return Order((*words, model, listed, "-o", output, *given), output, prepared)
+    if kind == "report" and on is None:
+        output = f"report-{number}/report.html"
+        project.write_table(folder / listed, state.specimens)
+        results = [job.output for job in _results_of_study(jobs)]
+        return Order((*words, *results, "--specimens", listed, "-o", output, "--no-open", *given), output)
     if kind == "report":
         before = result_of(jobs, (*CORRESPONDENCES, "fit"), on)
         return Order((*words, before.output, "--no-open", *given), f"{before.output}/report.html")
@@ -155,6 +162,23 @@ def result_of(jobs: Sequence[Job], kinds: Sequence[str], on: int | None) -> Job:
     missing = {"correspond": "a correspondence", "build": "a model", "fit": "fits of new scans"}
     needed = next((missing[kind] for kind in kinds if kind in missing), "an answer")
     raise InputError(f"This needs {needed}; run that first.")
+
+
+def _results_of_study(jobs: Sequence[Job]) -> list[Job]:
+    """Return the jobs whose results are in the report of the study: of each step the newest, and each answer once.
+
+    Raises:
+        InputError: there is none.
+    """
+    steps = {"redo": "correspond"}
+    newest: dict[str, Job] = {}
+    for job in jobs:
+        if job.status == "done" and job.kind in _STUDY:
+            is_answer = job.kind in QUESTIONS and job.kind != "morphospace"
+            newest[f"{job.kind} {job.on} {job.options}" if is_answer else steps.get(job.kind, job.kind)] = job
+    if not newest:
+        raise InputError("There are no results yet; bring the specimens into correspondence first.")
+    return sorted(newest.values(), key=lambda job: (_STUDY.index(job.kind), job.number))
 
 
 def checks(
