@@ -8,7 +8,7 @@ import pytest
 from pages import ONE_WINDOW, WINDOWS, viewer
 from pictures import change, drawn_share
 
-from same_blobs import HIDDEN, NAMES, write_same
+from same_blobs import FOLDED, HIDDEN, NAMES, write_same
 from shapespace.cli import main
 
 
@@ -24,8 +24,12 @@ def address(same: Path) -> Iterator[str]:
         yield found
 
 
-def ready(tab):
+def ready(tab, sides: int = 1):
     tab.until("window.shapespaceReady === true")
+    if sides == 1:
+        tab.page.get_by_test_id("sides-1").click()
+        tab.until("document.getElementById('which').textContent === '1 to 11 of 15'")
+        tab.until("window.shapespaceCells[11].positions !== null")
     tab.page.wait_for_timeout(700)
     return tab
 
@@ -61,6 +65,38 @@ def test_a_click_on_one_surface_marks_the_same_vertex_on_all(
     assert marked(tab, 0) == [] and tab.page.get_by_test_id("save").is_disabled()
     assert tab.page.evaluate("document.documentElement.scrollWidth <= window.innerWidth"), "it scrolls sideways"
     tab.shot(f"{viewport['width']}-{scheme}")
+    assert tab.complaints == [] and tab.asked == []
+
+
+def test_surfaces_open_on_both_sides_with_their_worst_places(open_tab, address: str) -> None:
+    tab = ready(open_tab(address), sides=2)
+    assert tab.page.locator(".cell:visible").count() == 6
+    assert tab.page.get_by_test_id("which").inner_text() == "1 to 5 of 15"
+    for side in ("view", "back"):
+        assert drawn_share(tab.page.get_by_test_id(f"{side}-1").screenshot()) > 0.1
+    box = tab.page.get_by_test_id("back-2").bounding_box()
+    tab.page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    (behind,) = marked(tab, 0)
+    depths = (
+        f"(c => [c.view, c.back].map(v => v.project(Array.from(c.positions.slice({3 * behind}, {3 * behind + 3})))[2]))"
+    )
+    front, back = tab.page.evaluate(f"{depths}(window.shapespaceCells[2])")
+    assert front > 0 > back, "the click was on the side that the front view does not show"
+    tab.until(f"document.querySelector('[data-testid=faults-fold]')?.innerText.includes('{FOLDED}')")
+    worst = tab.page.get_by_test_id("faults-fold").get_by_role("button").first
+    assert FOLDED in worst.inner_text() and "folded triangle" in worst.inner_text()
+    worst.click()
+    vertex = marked(tab, 0)[-1]
+    assert vertex != behind and all(marked(tab, k)[-1] == vertex for k in range(6))
+    place = f"Array.from(c.positions.slice({3 * vertex}, {3 * vertex + 3}))"
+    facing = tab.page.evaluate(f"(c => c.view.project({place})[2])(window.shapespaceCells[0])")
+    assert facing < 0, "it lies on the side that is shown"
+    for colour in ("growth", "distance"):
+        before = tab.page.get_by_test_id("view-1").screenshot()
+        tab.page.get_by_test_id(f"colour-{colour}").click()
+        tab.page.wait_for_timeout(700)
+        assert change(before, tab.page.get_by_test_id("view-1").screenshot()) > 0.01
+    tab.shot("worst")
     assert tab.complaints == [] and tab.asked == []
 
 

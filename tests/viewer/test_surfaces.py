@@ -14,9 +14,14 @@ import numpy as np
 import pytest
 from viewer_world import enter, served, unpacked
 
-from same_blobs import ASIDE, FAR, FOLDED, HIDDEN, NAMES, VERTICES, surface, write_same
+from same_blobs import ASIDE, FAR, FOLDED, HIDDEN, NAMES, VERTICES, mean_blob, surface, write_same
 from shapespace.errors import FileFormatError, InputError
+from shapespace.geometry.normals import Distortion, rms_size, vertex_normals
+from shapespace.geometry.similarity import fit_similarity
+from shapespace.io.files import sha256_of_file
+from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.report.render.scene import SCENE_SCRIPTS
+from shapespace.schemas import CorrespondRecord
 from shapespace.viewer import corresponding_surfaces as module
 from shapespace.viewer.corresponding_surfaces import Surfaces
 from shapespace.viewer.guard import SECURITY_HEADERS, Access
@@ -64,6 +69,45 @@ def test_a_surface_lies_on_the_mean_shape_and_misses_what_its_scan_does(client: 
     off = np.linalg.norm(arrays["positions"] - mean["positions"], axis=1)
     assert facts["name"] == HIDDEN and np.nanmean(off) < 6
     assert len(client.get(f"/api/surfaces/{HIDDEN}").content) < 6 * VERTICES + 500  # two bytes a number
+
+
+def test_the_worst_places_are_where_a_surface_is_folded_stretched_or_far_from_its_scan(client: httpx.Client) -> None:
+    facts, arrays = unpacked(client.get(f"/api/faults/{FOLDED}").content)
+    by_kind = {
+        kind: [place for place in facts["places"] if place["kind"] == kind] for kind in ("fold", "stretch", "distance")
+    }
+    own, mean = (surface(FOLDED, NAMES.index(FOLDED))[0], mean_blob())
+    folded = np.unique(mean.faces[Distortion.of(own, mean).folded])
+    assert by_kind["fold"] and {place["vertex"] for place in by_kind["fold"]} <= set(folded.tolist())
+    worst = by_kind["stretch"][0]
+    assert abs(worst["value"]) == pytest.approx(np.nanmax(np.abs(arrays["growth"])), rel=1e-5)
+    assert client.get(f"/api/faults/{ASIDE}").status_code == client.get("/api/faults/nobody").status_code == 404
+
+
+def test_the_worst_distance_is_where_the_scan_bulges_and_unknown_without_it(template: Path, tmp_path: Path) -> None:
+    shutil.copytree(template.parent, tmp_path / "work")
+    scan, record = (
+        tmp_path / "work" / "scans" / "able.ply",
+        tmp_path / "work" / "same" / f"able{CorrespondRecord.ENDING}",
+    )
+    mesh = read_mesh(scan)
+    bulge = 40
+    near = np.linalg.norm(mesh.vertices - mesh.vertices[bulge], axis=1) < 25
+    write_mesh(scan, mesh.with_vertices(mesh.vertices + 8 * near[:, None] * vertex_normals(mesh)))
+
+    def faults() -> tuple[list[dict], dict[str, np.ndarray]]:
+        facts, arrays = unpacked(Surfaces(record.parent).packed_faults("able"))
+        return [place for place in facts["places"] if place["kind"] == "distance"], arrays
+
+    assert faults()[0] == [] and "distance" not in faults()[1]  # the scan is not that of the record
+    record.write_text(json.dumps({**json.loads(record.read_text()), "hash": sha256_of_file(scan)}))
+    places, arrays = faults()
+    own = read_mesh(record.parent / f"able{CorrespondRecord.SURFACE}").vertices
+    assert np.linalg.norm(own[places[0]["vertex"]] - mesh.vertices[bulge]) < 25
+    assert places[0]["value"] == pytest.approx(np.nanmax(arrays["distance"]), rel=1e-5)
+    size = rms_size(mean_blob().vertices) * fit_similarity(mean_blob().vertices, own).scale
+    assert places[0]["value"] * size == pytest.approx(8, rel=0.2)
+    assert np.linalg.norm(places[0]["normal"]) == pytest.approx(1, abs=1e-2)
 
 
 def test_of_a_large_folder_names_and_surfaces_come_before_all_surfaces_are_read(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Sequence
 from functools import lru_cache
@@ -13,7 +14,7 @@ import numpy as np
 
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.geometry.mirror_plane import FLIP
-from shapespace.geometry.normals import faces_of
+from shapespace.geometry.normals import Distortion, faces_of, rms_size, vertex_normals
 from shapespace.io.tables.table_io import table_text
 from shapespace.report.blocks.wording import sentence, without_folders
 from shapespace.report.inputs.correspondence_folder import (
@@ -24,9 +25,11 @@ from shapespace.report.inputs.correspondence_folder import (
     distance_share,
     scan_status,
 )
+from shapespace.report.inputs.saved_fits import ScanNotFoundError
 from shapespace.report.render import palette as colours
 from shapespace.report.render.scene import decimate, pack, quantise
-from shapespace.report.render.thumbnails import SQUARES, checker_places
+from shapespace.report.render.thumbnails import SQUARES, checker_places, mean_at_vertices
+from shapespace.types import FloatArray
 from shapespace.version import __version__
 
 MAX_MARKED = 100
@@ -35,6 +38,7 @@ MAX_MARKED = 100
 _PAGE, _PAGE_BYTES = 11, 24 * 2**20  # surfaces on a page, and bytes that a page may send
 _MOST_DRAWN = 8_000  # triangles of a surface, whose edges are then about 4 pixels of a picture on the page
 _MOST_TURNING = 1_500  # while it turns and the processor draws, about 10 pixels
+_MOST_PLACES, _APART = 3, 0.2  # worst places of a kind on a surface, and their least distance, share of the size
 _LARGE = 4_000_000  # vertices of all surfaces together, which take about 2 s to read
 _BYTES_PER_VERTEX = 10  # bytes; three coordinates of 16 bits, one number of 32
 _STATUS_ORDER = ("unreadable", "excluded", "doubtful", "look", "converged")
@@ -57,6 +61,7 @@ class Surfaces:
         self._summary_lock = Lock()
         self._packed_mean: bytes | None = None
         self.packed_surface = lru_cache(maxsize=2 * _PAGE)(self._pack_surface)
+        self.packed_faults = lru_cache(maxsize=2 * _PAGE)(self._pack_faults)
 
     def about(self) -> dict[str, Any]:
         """Return the counts and colours that the page needs first, without reading surfaces."""
@@ -74,6 +79,7 @@ class Surfaces:
             "most_marked": MAX_MARKED,
             "clay": colours.CLAY,
             "unknown_colour": colours.UNKNOWN_COLOUR,
+            "diverging": colours.as_list(colours.DIVERGING),
             "sequential": colours.as_list(colours.SEQUENTIAL),
             "squares": SQUARES.round(3).tolist(),
             "marks": [list(colour) for colour in colours.CATEGORIES],
@@ -174,6 +180,41 @@ class Surfaces:
             arrays["std"] = 100 * placed.position_std
         return pack(arrays, {"name": name})
 
+    def _pack_faults(self, name: str) -> bytes:
+        """Return the growth (V,) of the area around each vertex, log of the ratio to the mean shape, the distances (V,)
+        from the scan, share of the size, and the worst places of the surface by kind.
+
+        Raises:
+            FileError: it cannot be read.
+            FileFormatError: it is damaged.
+            KeyError: there is no such scan in correspondence.
+        """
+        record = self._corresponded.records[name]
+        if record.is_excluded:
+            raise KeyError(name)
+        with self._lock:
+            self._corresponded.turn_upright()
+        mean, placed = self._corresponded.mean, self._corresponded.placed(name)
+        faces = faces_of(mean)
+        distortion = Distortion.of(mean.with_vertices(placed.vertices), mean)
+        growth = mean_at_vertices(distortion.growth, faces, len(mean.vertices))
+        folds = np.bincount(faces[distortion.folded].ravel(), minlength=len(mean.vertices)).astype(np.float64)
+        values = {"fold": folds, "stretch": growth}
+        arrays = {"growth": growth.astype(np.float32)}
+        with contextlib.suppress(ScanNotFoundError):
+            values["distance"] = self._corresponded.scan_on_mean(record, placed)[1]
+            arrays["distance"] = values["distance"].astype(np.float32)
+        if placed.position_std is not None:
+            values["uncertain"] = np.where(placed.seen, placed.position_std, np.nan)
+        normals = vertex_normals(mean)
+        places = [
+            {"kind": kind, "vertex": vertex, "value": value, "normal": normals[vertex].round(3).tolist()}
+            for kind, array in values.items()
+            for vertex, value in _worst_places(mean.vertices, array)
+        ]
+        far = values.get("distance", np.zeros(1))
+        return pack(arrays, {"places": places, "distance_limit": 100 * float(np.nanquantile(far, 0.98))})
+
     def positions_csv(self, vertices: Sequence[int]) -> str:
         """Return a CSV of the positions of `vertices` on every scan, in its own frame and unit; empty where missing.
 
@@ -197,3 +238,15 @@ class Surfaces:
     def public(self, sentence: str) -> str:
         """Return `sentence` without the folders of this machine."""
         return without_folders(sentence)
+
+
+def _worst_places(vertices: FloatArray, values: FloatArray) -> list[tuple[int, float]]:
+    """Return the vertices with the largest absolute `values` (V,), which lie apart, and these values; 0 is no place."""
+    left = np.nan_to_num(np.abs(values))
+    apart = _APART * rms_size(vertices)
+    places: list[tuple[int, float]] = []
+    while len(places) < _MOST_PLACES and left.max() > 0:
+        vertex = int(left.argmax())
+        places.append((vertex, float(values[vertex])))
+        left[np.linalg.norm(vertices - vertices[vertex], axis=1) < apart] = 0.0
+    return places

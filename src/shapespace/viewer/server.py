@@ -354,11 +354,14 @@ def surfaces_app(surfaces: Surfaces) -> ASGIApp:
     def surface_list(request: Request) -> Response:
         return json_response(surfaces.rows())
 
-    def surface(request: Request) -> Response:
-        try:
-            return binary(surfaces.packed_surface(request.path_params["name"]))
-        except KeyError:
-            raise HTTPException(404, "There is no such scan in correspondence; reload the page.") from None
+    def of_scan(pack: Callable[[str], bytes]) -> Callable[[Request], Response]:
+        def answer(request: Request) -> Response:
+            try:
+                return binary(pack(request.path_params["name"]))
+            except KeyError:
+                raise HTTPException(404, "There is no such scan in correspondence; reload the page.") from None
+
+        return answer
 
     def positions(request: Request) -> Response:
         numbers = request.query_params.get("vertices", "")[:_MAX_QUERY].split(",")
@@ -374,7 +377,8 @@ def surfaces_app(surfaces: Surfaces) -> ASGIApp:
         Route("/api/population", population),
         Route("/api/names", names),
         Route("/api/surfaces", surface_list),
-        Route("/api/surfaces/{name}", surface),
+        Route("/api/surfaces/{name}", of_scan(surfaces.packed_surface)),
+        Route("/api/faults/{name}", of_scan(surfaces.packed_faults)),
         Route("/api/places", positions),
     ]
     return application(routes, surfaces.public)

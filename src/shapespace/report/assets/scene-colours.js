@@ -5,7 +5,7 @@
   const Shapespace = window.Shapespace;
 
   /** Fill `element` with a bar of `map` from range[0] to range[1], its title and unit; open: values may lie beyond; keys: [text, colour] below it. */
-  Shapespace.colourBar = function (element, { map, range, unit = "mm", title = "", open = false, keys = [] }) {
+  Shapespace.colourBar = function (element, { map, range, unit = "mm", title = "", open = false, keys = [], labels = null }) {
     const css = map.map((c) => `rgb(${c.map((v) => Math.round(255 * v)).join(",")})`);
     const middle = (range[0] + range[1]) / 2;
     element.replaceChildren();
@@ -24,7 +24,7 @@
     for (const value of [range[0], middle, range[1]]) {
       const tick = document.createElement("span");
       const beyond = !open || value === middle || (value === range[0] && value === 0) ? "" : value < middle ? "\u2264 " : "\u2265 ";
-      tick.textContent = beyond + number(value);
+      tick.textContent = labels ? labels[ticks.childElementCount] : beyond + number(value);
       ticks.appendChild(tick);
     }
     element.append(heading, bar, ticks);

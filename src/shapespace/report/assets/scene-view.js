@@ -11,6 +11,9 @@
   const DRAFT_PIXELS = 3.2e5, STILL_PIXELS = 3e6, RESTS_MS = 160;
   const MANY = 4; // views; more take as long to show as to draw, and share half of the pixels
 
+  /** The camera on the opposite side of the target, upright as this one. */
+  const opposite = (state) => ({ ...copyCamera(state), yaw: state.yaw + Math.PI, pitch: -state.pitch, roll: -state.roll });
+
   /**
    * A canvas in `element` that shows surfaces and points, turned by mouse, touch and keys; drawn only when it changed.
    *
@@ -27,7 +30,7 @@
       this.lastRedrawMs = NaN; // how long the last one kept the page busy
       this._background = background;
       this._embedded = embedded;
-      this._linked = new Set();
+      this._linked = new Map(); // view -> whether it looks from the opposite side
       this._listeners = {};
       this._frame = document.createElement("div");
       this._camera = new parts.OrbitCamera(this._frame);
@@ -116,21 +119,22 @@
       if (this._camera.home) this.camera = this._camera.home;
     }
 
-    /** From now on both views share one camera. */
-    link(other) {
-      this._linked.add(other);
-      other._linked.add(this);
-      other._camera.state = copyCamera(this._camera.state);
-      other._camera.home = this._camera.home && copyCamera(this._camera.home);
+    /** From now on both views share one camera, or look from opposite sides. */
+    link(other, isOpposite = false) {
+      this._linked.set(other, isOpposite);
+      other._linked.set(this, isOpposite);
+      const copy = isOpposite ? opposite : copyCamera;
+      other._camera.state = copy(this._camera.state);
+      other._camera.home = this._camera.home && copy(this._camera.home);
       other.request();
     }
 
     _moved(from) {
       this.request();
       this._emit("camera", this);
-      for (const other of this._linked) {
+      for (const [other, isOpposite] of this._linked) {
         if (other === from) continue;
-        other._camera.state = copyCamera(this._camera.state);
+        other._camera.state = (isOpposite ? opposite : copyCamera)(this._camera.state);
         other._moved(this);
       }
     }
@@ -239,7 +243,7 @@
       this._disposed = true;
       views.delete(this);
       waiting.delete(this);
-      this._linked.forEach((other) => other._linked.delete(this));
+      for (const other of this._linked.keys()) other._linked.delete(this);
       if (this._resizes) this._resizes.disconnect();
       if (this._sees) this._sees.disconnect();
       for (const id of Array.from(this._things.keys())) this.remove(id);

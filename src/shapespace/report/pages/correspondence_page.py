@@ -10,7 +10,6 @@ from typing import TypeAlias
 import numpy as np
 
 from shapespace.errors import FileFormatError, ShapespaceError
-from shapespace.geometry.closest import build_engine
 from shapespace.report import figures
 from shapespace.report.blocks import sections
 from shapespace.report.blocks.blocks import (
@@ -49,7 +48,6 @@ from shapespace.report.blocks.wording import (
 )
 from shapespace.report.inputs.correspondence_folder import (
     Corresponded,
-    PlacedSurface,
     concerns_of,
     distance_share,
     drawable,
@@ -60,10 +58,8 @@ from shapespace.report.inputs.saved_fits import Folder, nice_ceiling
 from shapespace.report.pages.page import Chapter, Page
 from shapespace.report.render import thumbnails
 from shapespace.report.render.palette import DIVERGING, SEQUENTIAL
-from shapespace.report.render.scene import decimate
 from shapespace.reprs import describe_groups, first_names
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondRecord, Quality
-from shapespace.types import FloatArray, Mesh
 from shapespace.version import __version__
 
 # Items on a page: what can be looked through without paging, and a page that stays within its bytes.
@@ -78,7 +74,6 @@ _STATUS = {
     "look": ("needs review", "doubtful"),
     "converged": ("converged", "converged"),
 }
-_TRIANGLES_DRAWN = 400_000  # triangles; more are smaller than a pixel of the pictures
 
 _Make: TypeAlias = Callable[[CorrespondRecord], Cell]
 
@@ -436,7 +431,7 @@ class CorrespondencePage:
     def _still(self, record: CorrespondRecord, limit: float) -> tuple[Image, str]:
         """Return the picture of a scan, and a sentence on a missing scan."""
         if record in self.out:
-            scan = drawable(self._bounded(record))[0]
+            scan = drawable(self.result.bounded_scan(record))[0]
             if scan.faces is not None:
                 scan = scan.with_vertices(scan.vertices @ upright(scan).T)
             return self.page.image(thumbnails.mesh_still(scan), f"The scan {record.name}, excluded"), ""
@@ -444,22 +439,12 @@ class CorrespondencePage:
         scan, note = None, ""
         far = np.full(len(placed.vertices), nan)
         try:
-            scan, far = self._scan_on_mean(drawable(self._bounded(record))[0], placed)
+            scan, far = self.result.scan_on_mean(record, placed)
         except FileFormatError as error:
             note = f"The picture lacks the scan: {error}"
-        still = thumbnails.correspondence_strip(self.mean, placed.vertices, scan, far, limit)
+        still = thumbnails.correspondence_strip(self.mean, placed.vertices, scan, 100 * far, limit)
         seen = "the scan, the checkerboard, distances and areas" if scan else "the checkerboard and areas"
         return self.page.image(still, f"{record.name}: {seen}"), note
-
-    def _bounded(self, record: CorrespondRecord) -> Mesh:
-        return decimate(self.result.raw_scan(record), _TRIANGLES_DRAWN)[0]
-
-    def _scan_on_mean(self, scan: Mesh, placed: PlacedSurface) -> tuple[Mesh, FloatArray]:
-        """Return the scan moved onto the mean shape, and the distance of each vertex from it, percent of the size."""
-        moved = scan.with_vertices(placed.T_scan_mean.inverse().apply(scan.vertices))
-        far = np.full(len(placed.vertices), nan)
-        far[placed.seen] = build_engine(moved).query(placed.vertices[placed.seen]).distance
-        return moved, 100 * far / float(np.sqrt((self.mean.vertices**2).sum(axis=1).mean()))
 
     def numbers(self) -> list[Block]:
         """Return the table of all scans."""

@@ -79,7 +79,7 @@ def correspondence_strip(
     surface = mean.with_vertices(vertices)
     drawn_surface, drawn_distance = drawable(surface, distance)
     faces, distortion = faces_of(surface), Distortion.of(surface, mean)
-    _, growth = drawable(surface, _at_vertices(distortion.growth, faces, len(vertices)))
+    _, growth = drawable(surface, mean_at_vertices(distortion.growth, faces, len(vertices)))
     layers = [[checker_layer(surface, checker_places(mean))]]
     if scan is not None:
         layers = [
@@ -100,7 +100,7 @@ def correspondence_strip(
     )
 
 
-def _at_vertices(values: FloatArray, faces: IntArray, vertices: int) -> FloatArray:
+def mean_at_vertices(values: FloatArray, faces: IntArray, vertices: int) -> FloatArray:
     """Return the mean (V,) of the known values of the triangles around each vertex."""
     known = np.isfinite(values)
     flat = faces[known].ravel()

@@ -17,24 +17,33 @@
   let marks = []; // numbers of vertices
   let named = []; // landmarks of the studio's project: {name, vertex}
   let colour = "squares";
+  let sides = 2; // views of each surface, the second from the opposite side
+  let faults = new Map(); // name of a scan of the page -> {places, arrays}
   let turn = 0; // a page that is still on its way is not shown when another was asked for
 
   const percent = (share) => `${(100 * share).toFixed(share > 0 && share < 0.0995 ? 1 : 0)} %`;
 
   // The grid --------------------------------------------------------------------------------------------------------
 
+  const perPage = () => (sides === 2 ? Math.max(1, Math.floor((about.page + 1) / 2) - 1) : about.page);
+  const viewsOf = (cell) => [cell.view, cell.back].slice(0, sides);
+
   function makeCells() {
     for (let k = 0; k <= about.page; k++) {
-      const canvas = h("div", { class: "view", "data-testid": `view-${k}` });
+      const front = h("div", { class: "view front", "data-testid": `view-${k}` }), behind = h("div", { class: "view behind", "data-testid": `back-${k}` });
       const name = h("strong", {}), note = h("span", { class: "note", "data-testid": `note-${k}` });
-      const box = h("div", { class: "cell", "data-testid": `cell-${k}` }, canvas, note, h("p", {}, name));
+      const box = h("div", { class: "cell", "data-testid": `cell-${k}` }, front, behind, note, h("p", {}, name));
       $("grid").append(box);
-      const cell = { box, name, note, marked: [], positions: null, std: null, view: new Shapespace.View(canvas, { label: "A surface in 3-D" }) };
-      cell.view.on("click", (event) => {
-        const hit = cell.view.pick(event.clientX, event.clientY, ["surface"]);
-        if (hit) addMark(hit.vertex);
+      const cell = { box, name, note, marked: [], positions: null, std: null };
+      [cell.view, cell.back] = [front, behind].map((element) => {
+        const view = new Shapespace.View(element, { label: "A surface in 3-D" });
+        view.on("click", (event) => {
+          const hit = view.pick(event.clientX, event.clientY, ["surface"]);
+          if (hit) addMark(hit.vertex);
+        });
+        startDragging(cell, view, element);
+        return view;
       });
-      startDragging(cell, canvas);
       cells.push(cell);
     }
   }
@@ -43,27 +52,46 @@
     cell.positions = positions;
     cell.std = std;
     cell.name.textContent = name;
-    cell.view.label = `${name} in 3-D`;
-    cell.view.setSurface("surface", { positions, faces: mean.faces, draft: mean.draft, colour: about.clay });
+    cell.scan = name;
+    viewsOf(cell).forEach((view, k) => {
+      view.label = `${name} in 3-D${k ? ", from the opposite side" : ""}`;
+      view.setSurface("surface", { positions, faces: mean.faces, draft: mean.draft, colour: about.clay });
+    });
     paint(cell);
     drawMarks(cell);
   }
 
-  function paint(cell) {
-    if (!cell.positions) return;
-    if (colour === "plain") cell.view.paint("surface", null);
-    else if (colour === "squares") cell.view.paint("surface", mean.places, { squares: about.squares });
-    else if (colour === "std") cell.view.paint("surface", cell.std || null, { map: about.sequential, range: [0, stdLimit] });
-    else cell.view.paint("surface", missing, { map: about.sequential, range: [0, most()] });
+  const AREA_LIMIT = Math.log(2); // as in the report: half to twice the area
+  const percentOf = (values) => values.map((value) => 100 * value);
+
+  /** Values and colours of a surface: arguments of `View.paint`. */
+  function coloursOf(cell) {
+    const found = faults.get(cell.scan)?.arrays;
+    if (colour === "squares") return [mean.places, { squares: about.squares }];
+    if (colour === "missing") return [missing, { map: about.sequential, range: [0, most()] }];
+    if (colour === "std") return [cell.std || null, { map: about.sequential, range: [0, stdLimit] }];
+    if (colour === "growth") return [found?.growth || null, { map: about.diverging, range: [-AREA_LIMIT, AREA_LIMIT] }];
+    if (colour === "distance") return [found?.distance || null, { map: about.sequential, range: [0, distanceLimit()] }];
+    return [null];
   }
+
+  function paint(cell) {
+    if (cell.positions) for (const view of viewsOf(cell)) view.paint("surface", ...coloursOf(cell));
+  }
+
+  /** End of the scale of distances, percent: 98 % of the vertices of each surface of the page are nearer. */
+  const distanceLimit = () => Math.max(0.1, ...Array.from(faults.values(), ({ limit }) => limit));
 
   let missing, stdLimit;
   const most = () => [5, 10, 25, 50, 100].find((limit) => missing.every((value) => value <= limit));
 
   function drawBar() {
-    const title = { missing: "Scans that do not show the vertex", std: "Standard deviation along the surface, of the size" }[colour];
+    const title = { missing: "Scans that do not show the vertex", std: "Standard deviation along the surface, of the size", distance: "Distance from the scan, of the size", growth: "Area relative to the mean shape" }[colour];
     $("scale").hidden = !title;
-    if (title) Shapespace.colourBar($("scale"), { map: about.sequential, range: [0, colour === "std" ? stdLimit : most()], unit: "%", title });
+    if (!title) return;
+    const range = colour === "growth" ? [-1, 1] : [0, { std: stdLimit, distance: distanceLimit(), missing: most() }[colour]];
+    const scale = colour === "growth" ? { map: about.diverging, unit: "", labels: ["half", "equal", "twice"] } : { map: about.sequential, unit: "%" };
+    Shapespace.colourBar($("scale"), { ...scale, range, title });
   }
 
   // Marks -----------------------------------------------------------------------------------------------------------
@@ -96,7 +124,7 @@
   }
 
   /** A mark follows the pointer that takes it, on all surfaces at once. */
-  function startDragging(cell, canvas) {
+  function startDragging(cell, view, canvas) {
     let taken = null;
     const during = (action) => (event) => {
       if (!taken) return;
@@ -104,14 +132,14 @@
       action(event);
     };
     canvas.addEventListener("pointerdown", (event) => {
-      const hit = event.button === 0 && cell.marked.length ? cell.view.pick(event.clientX, event.clientY, ["marks", "surface"]) : null;
+      const hit = event.button === 0 && cell.marked.length ? view.pick(event.clientX, event.clientY, ["marks", "surface"]) : null;
       if (!hit || hit.id !== "marks") return;
       event.stopPropagation();
       taken = cell.marked[hit.vertex];
       canvas.setPointerCapture(event.pointerId);
     }, true);
     canvas.addEventListener("pointermove", during((event) => {
-      const hit = cell.view.pick(event.clientX, event.clientY, ["surface"]);
+      const hit = view.pick(event.clientX, event.clientY, ["surface"]);
       if (!hit || hit.vertex === taken.vertex || marks.includes(hit.vertex)) return;
       if (taken.name === undefined) marks[marks.indexOf(taken.vertex)] = hit.vertex;
       else named.find((one) => one.name === taken.name).vertex = hit.vertex;
@@ -134,7 +162,7 @@
       cell.marked.push(mark);
       shown.push({ position, label: mark.name ?? String(mark.vertex), colour: markColour(k) });
     });
-    cell.view.marks("marks", shown);
+    for (const view of viewsOf(cell)) view.marks("marks", shown);
     cell.note.textContent = gone.length ? `${gone.length > 3 ? `${gone.length} marked vertices` : gone.join(", ")} not shown` : "";
   }
 
@@ -185,13 +213,15 @@
   }
 
   const showPage = guarded(async (from) => {
-    const mine = ++turn;
+    const mine = ++turn, count = perPage();
     first = Math.max(0, Math.min(from, Math.max(0, wanted.length - 1)));
-    const shown = wanted.slice(first, first + about.page);
+    const shown = wanted.slice(first, first + count);
     $("previous").disabled = first === 0;
-    $("next").disabled = first + about.page >= wanted.length;
+    $("next").disabled = first + count >= wanted.length;
     $("which").textContent = shown.length ? `${first + 1} to ${first + shown.length} of ${wanted.length}` : "No scan";
     cells.slice(1).forEach((cell, k) => { cell.box.hidden = k >= shown.length; });
+    faults = new Map();
+    drawFaults();
     const problems = [];
     for (let k = 0; k < shown.length; k++) {
       const cell = cells[k + 1];
@@ -205,21 +235,71 @@
       if (arrays) put(cell, shown[k].name, arrays);
       else cell.box.hidden = true;
     }
-    for (const cell of cells.slice(1 + shown.length)) {
-      cell.positions = null;
-      cell.view.remove("surface");
-      cell.view.remove("marks");
-    }
+    for (const cell of cells.slice(1 + shown.length)) clear(cell);
     window.shapespaceReady = true;
     document.body.dataset.ready = "true";
+    findFaults(mine, shown);
     if (problems.length) throw new Error(problems.join(" "));
   });
 
+  function clear(cell) {
+    cell.positions = null;
+    for (const view of [cell.view, cell.back]) { view.remove("surface"); view.remove("marks"); }
+  }
+
+  // Worst places ----------------------------------------------------------------------------------------------------
+
+  const FAULTS = {
+    fold: ["Folds", (value) => `${value} folded ${value === 1 ? "triangle" : "triangles"}`],
+    stretch: ["Stretch", (value) => `${value < 0 ? "shrunk" : "grown"} ${Math.exp(Math.abs(value)).toFixed(1)} times`],
+    distance: ["Distance from the scan", (value) => `${percent(value)} of the size`],
+    uncertain: ["Uncertain position", (value) => `\u00b1 ${percent(value)} of the size`],
+  };
+  const MOST_FAULTS = 4; // places of each kind
+
+  /** Ask for the worst places of the surfaces of the page, one after the other, as each scan is read for them. */
+  async function findFaults(mine, shown) {
+    for (const { name } of shown) {
+      let found = null;
+      try { found = await binary(`api/faults/${encodeURIComponent(name)}`); } catch (error) { /* its surface is not shown either */ }
+      if (mine !== turn) return;
+      if (found) faults.set(name, { places: found.facts.places, limit: found.facts.distance_limit, arrays: { growth: found.arrays.growth, distance: found.arrays.distance && percentOf(found.arrays.distance) } });
+      drawFaults();
+    }
+    if (colour === "growth" || colour === "distance") { cells.forEach(paint); drawBar(); }
+  }
+
+  /** Turn all surfaces so that a place faces the user, and mark it. */
+  function lookAt({ vertex, normal: [x, y, z] }) {
+    addMark(vertex);
+    cells[0].view.camera = { yaw: Math.atan2(x, z), pitch: Math.asin(Math.max(-1, Math.min(1, y))) };
+  }
+
+  function drawFaults() {
+    const all = Array.from(faults, ([name, { places }]) => places.map((place) => ({ name, ...place }))).flat();
+    const kinds = Object.entries(FAULTS).map(([kind, [title, words]]) => {
+      const worst = all.filter((place) => place.kind === kind).sort((a, b) => Math.abs(b.value) - Math.abs(a.value)).slice(0, MOST_FAULTS);
+      return worst.length ? h("div", { "data-testid": `faults-${kind}` }, h("h3", {}, title), ...worst.map((place) => h("button", { type: "button", class: "small quiet", onclick: () => lookAt(place) }, h("strong", {}, place.name), ` ${words(place.value)}`))) : null;
+    });
+    $("faults").replaceChildren(...kinds.filter(Boolean));
+    for (const name of ["growth", "distance"]) $("colours").querySelector(`[data-colour=${name}]`).hidden = !faults.size;
+  }
+
   function startScans() {
-    $("previous").addEventListener("click", () => showPage(first - about.page));
-    $("next").addEventListener("click", () => showPage(first + about.page));
+    $("previous").addEventListener("click", () => showPage(first - perPage()));
+    $("next").addEventListener("click", () => showPage(first + perPage()));
     $("front").addEventListener("click", () => cells[0].view.reset());
     $("filter").addEventListener("input", filterRows);
+    for (const button of $("sides").querySelectorAll("button")) {
+      button.addEventListener("click", () => {
+        sides = Number(button.dataset.sides);
+        for (const other of $("sides").querySelectorAll("button")) other.setAttribute("aria-pressed", String(other === button));
+        $("grid").classList.toggle("two", sides === 2);
+        cells.slice(1).forEach(clear);
+        put(cells[0], "Mean shape", mean);
+        showPage(first);
+      });
+    }
     for (const button of $("colours").querySelectorAll("button")) {
       button.addEventListener("click", () => {
         colour = button.dataset.colour;
@@ -239,7 +319,8 @@
     put(cells[0], "Mean shape", mean);
     cells[0].view.frame(["surface"], 1.2); // scans are larger than the mean shape in some directions
     for (const cell of cells.slice(1)) cells[0].view.link(cell.view);
-    Viewer.startTheme(() => cells.forEach((cell) => cell.view.request()));
+    for (const cell of cells) cell.view.link(cell.back, true);
+    Viewer.startTheme(() => cells.forEach((cell) => viewsOf(cell).forEach((view) => view.request())));
     Viewer.startMessages();
     startMarks();
     startLandmarks();
