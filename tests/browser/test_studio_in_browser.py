@@ -132,6 +132,29 @@ def exclude_in_morphospace(tab, user: User, project: Path) -> None:
         tab.page.wait_for_timeout(100)
 
 
+def is_outdated_until_undone(tab, user: User) -> None:
+    """Change a class of the table: the answer that used it is marked on its screen and in the list of results."""
+    tab.page.get_by_test_id("tab-specimens").click()
+    tab.page.get_by_test_id("layout-table").click()
+    tab.page.get_by_test_id("cell-bone_000-group").fill("elsewhere")
+    tab.page.keyboard.press("Enter")
+    tab.page.get_by_test_id("tab-export").click()
+    user.sees("outdated")
+    assert "1 result is outdated" in tab.page.get_by_test_id("outdated").inner_text()
+    tab.page.get_by_test_id("tab-questions").click()
+    tab.page.get_by_test_id("earlier-3").click()
+    user.sees("outdated-3")
+    assert tab.page.get_by_test_id("again-3").is_enabled()
+    assert barriers(tab) == []
+    tab.shot("outdated")
+    tab.page.get_by_test_id("tab-model").click()
+    assert tab.page.get_by_test_id("outdated-2").count() == 0, "the model does not depend on the table"
+    tab.page.get_by_test_id("tab-specimens").click()
+    tab.page.get_by_test_id("undo").click()
+    tab.page.get_by_test_id("tab-export").click()
+    tab.page.get_by_test_id("outdated").wait_for(state="detached")
+
+
 def write_bones(folder: Path, count: int) -> Path:
     assert main(["data", "bones", "-o", str(folder), "--count", str(count), "--quiet"]) == 0
     return folder
@@ -197,6 +220,7 @@ def test_raw_scans_become_a_report_by_clicks_and_history_gives_the_same_numbers(
             assert barriers(tab) == [], screen
         user.sees("history")
         assert "shapespace compare" in tab.page.get_by_test_id("history").inner_text()
+        is_outdated_until_undone(tab, user)
         if count == 12:
             exclude_in_morphospace(tab, user, project)
         assert tab.complaints == [] and tab.asked == []

@@ -14,9 +14,10 @@ from shapespace.cli.command_table import summaries_and_options
 from shapespace.cli.forms import forms
 from shapespace.commands.inputs import given_scans
 from shapespace.errors import FileError, FileFormatError, InputError
+from shapespace.io.files import make_folder
 from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.types import Mesh
-from shapespace.viewer.studio.job_commands import checks, order
+from shapespace.viewer.studio.job_commands import checks, order, outdated_results
 from shapespace.viewer.studio.jobs import Job, Order, history
 from shapespace.viewer.studio.project import (
     MatchedBlock,
@@ -258,6 +259,7 @@ def test_scans_in_another_unit_or_mirrored_are_written_in_mm_for_the_commands(
     edit(project, what="unit", ids=["anna", "ben"], unit="cm")
     edit(project, what="mirror", ids=["ben"], mirrored=True)
     made = order(project, [], forms(summaries_and_options()), "correspond", {}, None, 1)
+    made.write_files(project.folder)
     monkeypatch.chdir(project.folder)
     for words in made.before:
         assert main(list(words)) == 0
@@ -342,9 +344,80 @@ def test_each_action_is_a_command_line_that_the_parser_takes(project: Project, t
     arguments = parser().parse_args(ordered.arguments)
     assert callable(arguments.run)
     if kind == "score":
-        written = {path.name: path.read_text() for path in (project.folder / "inputs").glob("*.csv")}
-        assert "anna" in written["0005-reference.csv"] and "carl" not in written["0005-reference.csv"]
-        assert "carl" in written["0005.csv"] and "anna" not in written["0005.csv"]
+        written = ordered.files
+        assert "anna" in written["inputs/0005-reference.csv"] and "carl" not in written["inputs/0005-reference.csv"]
+        assert "carl" in written["inputs/0005.csv"] and "anna" not in written["inputs/0005.csv"]
+
+
+class Done:
+    """A project whose jobs all succeed at once."""
+
+    def __init__(self, project: Project) -> None:
+        self.project, self.jobs, self.forms = project, list[Job](), forms(summaries_and_options())
+
+    def run(self, kind: str, options: dict[str, str] | None = None, on: int | None = None) -> int:
+        number = len(self.jobs) + 1
+        made = order(self.project, self.jobs, self.forms, kind, options or {}, on, number)
+        made.write_files(self.project.folder)
+        self.jobs.append(
+            Job(number=number, kind=kind, arguments=made.arguments, output=made.output, before=made.before,
+                options=options or {}, on=made.on, status="done")
+        )  # fmt: skip
+        if kind == "correspond":
+            for name in ids(self.project):
+                tetrahedron(make_folder(self.project.folder / made.output) / f"{name}.ply", 1.0)
+        return number
+
+    @property
+    def outdated(self) -> dict[int, str]:
+        return dict(outdated_results(self.project, self.jobs, self.forms))
+
+
+@pytest.fixture
+def answered(project: Project) -> Done:
+    """Correspondence, model, a comparison of groups, one by age, and the report of the study."""
+    join_table(project, b"id,group,age\nanna,a,1\nben,a,2\ncarl,b,3\n")
+    done = Done(project)
+    for kind, formula in (
+        ("correspond", ""),
+        ("build", ""),
+        ("compare", "~ group"),
+        ("compare", "~ age"),
+        ("report", ""),
+    ):
+        done.run(kind, {"--formula": formula} if formula else {})
+    return done
+
+
+def test_results_are_outdated_by_the_edits_that_they_depend_on_and_by_no_others(answered: Done) -> None:
+    project = answered.project
+    assert answered.outdated == {}
+    edit(project, what="cells", cells=[{"id": "ben", "column": "group", "value": "b"}])
+    assert answered.outdated == {3: "table", 5: "source"}
+    edit(project, what="add-column", column="site")
+    edit(project, what="rename", id="carl", to="carol")
+    project.undo(project.revision)
+    project.undo(project.revision)
+    project.undo(project.revision)
+    assert answered.outdated == {}
+    edit(project, what="landmarks", landmarks={"tip": 1})
+    assert answered.outdated == {2: "landmarks", 5: "source"}
+    project.undo(project.revision)
+    edit(project, what="include", ids=["anna"], included=False)
+    assert answered.outdated == {1: "specimens", 2: "specimens", 3: "specimens", 4: "specimens", 5: "source"}
+    project.undo(project.revision)
+    edit(project, what="mirror", ids=["anna"], mirrored=True)
+    assert answered.outdated == {1: "specimens", 2: "source", 3: "source", 4: "source", 5: "source"}
+    project.undo(project.revision)
+    answered.run("redo", {"name": "ben"})
+    assert answered.outdated == {2: "redone", 3: "redone", 4: "redone", 5: "redone"}
+    assert answered.run("build") == 7 and 7 not in answered.outdated
+
+
+def test_a_result_that_is_run_again_with_the_same_settings_is_up_to_date(answered: Done) -> None:
+    edit(answered.project, what="cells", cells=[{"id": "ben", "column": "group", "value": "b"}])
+    again = answered.run("compare", answered.jobs[2].options, answered.jobs[2].on)
+    assert again not in answered.outdated and answered.outdated[3] == "table"
 
 
 GROUPS = {f"s{k:02}": ("a" if k % 2 else "b", f"g{k % 3}", str(20 + 3 * k)) for k in range(12)}
@@ -387,6 +460,7 @@ def test_the_studio_and_the_command_give_the_same_answer(
     found = checks(analysed, described, kind, options, done[0])
     assert [one for one in found if one["level"] == "problem"] == []
     made = order(analysed, done, described, kind, options, None, 2)
+    made.write_files(analysed.folder)
     studio = answer_of(made.arguments, capsys)
     lines = [f"{name},{','.join(cells)}" for name, cells in reversed(GROUPS.items())]
     Path("table.csv").write_text("\n".join(["specimen,Group #,sex (m/f),age", *lines]))

@@ -591,7 +591,7 @@ COMMANDS: tuple[CommandSpec, ...] = (
         settings=(_LANDMARK_STDDEV, setting("seed", "S", source=COMPLETION, parse=values.natural)),
     ),
     CommandSpec(
-        "report", "write one HTML report of results: of a folder, or of a whole study",
+        "report", "write one HTML report of results: of a folder, or of a study",
         ("shapespace fit model.h5 scans -o out --stages", "shapespace report out",
          "shapespace report corresponding model.h5 groups --specimens table.csv -o study.html"),
         "commands.answers:report",

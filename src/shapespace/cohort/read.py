@@ -162,16 +162,19 @@ def write_cohort_file(path: Path | str, data: Path | str, **settings: Any) -> No
     path = Path(path)
     if not is_cohort_file(path):
         raise InputError(f"{path} needs the ending {COHORT_ENDING}; give the name of a cohort file.")
+    write_text(path, cohort_file_text(path.absolute().parent, data, **settings))
+
+
+def cohort_file_text(folder: Path, data: Path | str, **settings: Any) -> str:
+    """Return the content of a cohort file in `folder`; see `write_cohort_file`."""
     CohortConfig(**settings)
-    folder = path.absolute().parent
     stated = {"data": data, **{name: value for name, value in settings.items() if value is not None}}
     for name in ("data", *PATHS):
         if name in stated:
             with contextlib.suppress(ValueError):  # another drive: an absolute path
                 stated[name] = os.path.relpath(stated[name], folder)
             stated[name] = Path(stated[name]).as_posix()
-    lines = [f"{name} = {json.dumps(value, ensure_ascii=False)}\n" for name, value in stated.items()]
-    write_text(path, "".join(lines))
+    return "".join(f"{name} = {json.dumps(value, ensure_ascii=False)}\n" for name, value in stated.items())
 
 
 def read_cohort(

@@ -83,7 +83,8 @@
   function JobForm({ kind, sources = [], strong, checked, disabled, label, children }) {
     const form = Studio.forms[kind];
     const initial = useMemo(() => Object.fromEntries((form ? form.options : []).map((option) => [option.flag, option.initial === null ? "" : option.initial])), [form]);
-    const [values, setValues] = useState(initial);
+    // The settings open as the last run had them.
+    const [values, setValues] = useState(() => ({ ...initial, ...Studio.jobsOf([kind])[0]?.options }));
     const [on, setOn] = useState("");
     const [checks, setChecks] = useState(null);
     const [starting, setStarting] = useState(false);
@@ -198,6 +199,11 @@
       </div>`;
   }
 
+  /** What changed since a result was computed, with a button that computes it again with the same settings. */
+  const Outdated = ({ job }) => job.outdated && html`
+    <p class="outdated" role="status" data-testid=${`outdated-${job.number}`}><strong>${J.outdated[job.outdated]}</strong>
+      ${job.outdated !== "source" && html` <${Button} edits small testid=${`again-${job.number}`} disabled=${Studio.jobsOf([job.kind]).some(Studio.isActive)} onclick=${() => Studio.runJob(job.kind, job.options, job.outdated === "redone" ? null : job.on)}>${J.sameSettings}<//>`}</p>`;
+
   /** The results of `kinds`, `first` or the newest at first; returns the chosen job and the select. */
   function useResult(kinds, first = null) {
     const [chosen, setChosen] = useState(first);
@@ -215,6 +221,7 @@
           ${finished.map((one) => html`<option key=${one.number} value=${one.number} selected=${one === job}>${kindOf(one)}, ${J.title(one)}</option>`)}</select></label>` : html`<strong>${kindOf(job)}</strong>`}
         <span class="grow"></span>
         ${job.views.length > 0 && html`<a href=${job.views[0].href} target="_blank" rel="noopener" data-testid="open-result">${J.full}</a>`}
+        <${Outdated} job=${job} />
       </div>`;
     return [job, select];
   }
@@ -234,5 +241,14 @@
     return shown.map((job) => html`<${JobPanel} key=${job.number} job=${job} />`);
   };
 
-  Object.assign(Studio, { duration, kindOf, JobForm, JobPanel, ResultFrame, Settings, Jobs, useResult });
+  /** Jobs that other screens show: those that run or wait, and the newest one of a kind if it failed. */
+  const Elsewhere = ({ kinds }) => {
+    const newest = new Map(Studio.state.project.jobs.map((job) => [job.kind, job]));
+    const shown = Studio.state.project.jobs.filter((job) => !kinds.includes(job.kind) && (Studio.isActive(job) || (job.status === "failed" && newest.get(job.kind) === job)));
+    return shown.length > 0 && html`<div class="elsewhere" data-testid="elsewhere">${shown.map((job) => html`<p key=${job.number} class=${job.status} data-testid=${`elsewhere-${job.number}`}>
+      <strong>${kindOf(job)}</strong> <span class="hint">${J.statuses[job.status]}${job.progress ? `, ${J.progress(job.progress)}` : job.status === "failed" ? `: ${job.message}` : ""}</span>
+      ${Studio.isActive(job) && html`<${Button} edits small testid=${`elsewhere-cancel-${job.number}`} onclick=${() => Studio.act(`/api/jobs/${job.number}/cancel`)}>${J.cancel}<//>`}</p>`)}</div>`;
+  };
+
+  Object.assign(Studio, { Elsewhere, Outdated, duration, kindOf, JobForm, JobPanel, ResultFrame, Settings, Jobs, useResult });
 })();

@@ -38,7 +38,8 @@
   Studio.Questions = function Questions({ next }) {
     const [{ kind, first }, setQuestion] = useState({});
     if (kind) return html`<${Question} key=${kind} kind=${kind} first=${first} next=${next} onback=${() => setQuestion({})} />`;
-    const earlier = Studio.jobsOf(KINDS);
+    // Of runs with the same settings the newest counts.
+    const earlier = Array.from(new Map(Studio.jobsOf(KINDS).reverse().map((job) => [JSON.stringify([job.kind, job.on, job.options]), job])).values()).reverse();
     return html`
       <div class="fill scroll" data-testid="screen-questions">
         <div class="row bar"><h2>${Q.title}</h2><span class="grow"></span>
@@ -48,7 +49,7 @@
         </ul>
         ${earlier.length > 0 && html`<h3>${Q.earlier}</h3>
           <ul class="recent">${earlier.map((job) => html`<li key=${job.number}><button type="button" data-testid=${`earlier-${job.number}`} onclick=${() => setQuestion({ kind: job.kind, first: job.number })}>
-            <strong>${Studio.kindOf(job)}</strong><span class="hint">${T.jobs.statuses[job.status]}${job.sentences.length ? `: ${job.sentences[0]}` : ""}</span></button></li>`)}</ul>`}
+            <strong>${Studio.kindOf(job)}</strong><span>${T.jobs.title(job)}${job.outdated ? html` <span class="tag">${T.jobs.isOutdated}</span>` : ""}</span><span class="hint">${T.jobs.statuses[job.status]}${job.sentences.length ? `: ${job.sentences[0]}` : ""}</span></button></li>`)}</ul>`}
       </div>`;
   };
 })();

@@ -30,7 +30,7 @@
     const isQuestion = Studio.QUESTIONS.includes(job.kind);
     return html`
       <tr data-testid=${`export-${job.number}`}>
-        <th scope="row"><strong>${Studio.kindOf(job)}</strong><span class="hint">${job.output}</span></th>
+        <th scope="row"><strong>${Studio.kindOf(job)}</strong>${job.outdated && html` <span class="tag">${T.jobs.isOutdated}</span>`}<span class="hint">${T.jobs.title(job)}</span></th>
         <td><${Files} job=${job} /></td>
         <td><div class="row">
           <a class="button" href=${`/zip/${job.number}`} download data-testid=${`zip-${job.number}`}>${T.export.zip}</a>
@@ -43,11 +43,12 @@
 
   Studio.Export = function Export({ project }) {
     const done = project.jobs.filter((job) => job.status === "done").reverse();
-    const busy = Studio.jobsOf(["report"]).some(Studio.isActive);
+    const busy = Studio.jobsOf(["report"]).some(Studio.isActive), outdated = done.filter((job) => job.outdated).length;
     return html`
       <div class="fill scroll" data-testid="screen-export">
         <div class="row bar"><div><h2>${T.export.title}</h2><p class="hint">${T.export.intro}</p></div><span class="grow"></span>
           <${Button} edits strong testid="write-report" disabled=${!done.length || busy} onclick=${() => Studio.runJob("report")}>${T.export.report}<//></div>
+        ${outdated > 0 && html`<p class="outdated" role="status" data-testid="outdated">${T.export.outdated(outdated)}</p>`}
         <${Jobs} kinds=${["report", "convert", "export", "figures"]} />
         ${Studio.jobsOf(Studio.QUESTIONS).filter(Studio.isActive).map((job) => html`<${JobPanel} key=${job.number} job=${job} />`)}
         ${Studio.newest("build") && Studio.forms.convert && html`<details class="narrow" data-testid="convert"><summary>${T.export.convert}</summary><${JobForm} kind="convert" sources=${["build"]} /></details>`}

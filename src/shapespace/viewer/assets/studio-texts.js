@@ -4,6 +4,8 @@
 
   const count = (number, one, many) => `${number.toLocaleString("en")} ${number === 1 ? one : many || `${one}s`}`;
 
+  const NAMED_BY = ["--formula", "--target", "--along", "--group", "--subject", "--time", "--reference"]; // options that name a run
+
   window.ShapespaceTexts = {
     count,
     offline: "The studio's server does not answer; check that shapespace studio still runs. This page continues when it is back.",
@@ -77,7 +79,12 @@
       settings: "Settings, and run again", run: "Run", runAgain: "Run again", runOf: { correspond: "Bring into correspondence", build: "Build the model", fit: "Fit the scans" },
       more: (number) => `${count(number, "more option")}`, cancel: "Cancel", continue: "Continue", log: "Log", command: "Command", copy: "Copy", copied: "Copied",
       noLog: "The log is empty.", result: "Result", noResult: "Results appear here.", required: "required", yes: "yes", none: "(none)", default: "(default)",
-      title: (job) => `${job.number}: ${job.output || job.kind}`, source: "Made from", newest: "newest result",
+      title: (job) => `${job.number}: ${NAMED_BY.map((flag) => job.options[flag]).filter(Boolean).join(", ") || job.output || job.kind}`,
+      sameSettings: "Run again with the same settings", isOutdated: "outdated",
+      outdated: {
+        specimens: "Made before specimens were changed, excluded or included.", table: "Made before the table was changed.", landmarks: "Made before the landmarks were changed.",
+        redone: "Made before a scan was registered again.", source: "Made from a result that is outdated; run that one again first.",
+      }, source: "Made from", newest: "newest result",
       progress: ({ doing, done, total }) => total ? `${doing} (${done} of ${total})` : doing, progressLabel: (kind) => `Progress of: ${kind}`,
       took: (time) => `took ${time}`, left: (time) => `about ${time} left`,
       seconds: (value) => `${value} s`, minutes: (value) => `${value} min`, hours: (value) => `${value} h`,
@@ -108,7 +115,7 @@
     },
     export: {
       title: "Export", intro: "Download results, or write one report of the study that opens in any browser: specimens, correspondence, model, morphospace and each answer.", report: "Write report of the study", reportOf: "Write report of this", none: "There are no results yet.",
-      files: "Files", size: "Size", zip: "Download all (ZIP)", figures: "Figures in SVG, PDF and PNG", convert: "Model in another format", noFiles: "No files.", show: "Files",
+      files: "Files", size: "Size", zip: "Download all (ZIP)", outdated: (number) => `${count(number, "result is", "results are")} outdated: made before later edits. Run them again before you use them.`, figures: "Figures in SVG, PDF and PNG", convert: "Model in another format", noFiles: "No files.", show: "Files",
       result: "Result", actions: "Downloads", download: (path) => `Download ${path}`,
     },
     history: {

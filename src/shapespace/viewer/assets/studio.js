@@ -46,6 +46,7 @@
         </div>
         <${Button} edits small testid="close-project" onclick=${() => Studio.act("/api/close")}>${T.closeProject}<//>
       </nav>
+      <${Studio.Elsewhere} kinds=${screen === "history" ? project.jobs.map((job) => job.kind) : KINDS[screen] || []} />
       <main>
         <div id="screen" role="tabpanel" tabindex="-1" aria-labelledby=${`tab-${screen}`} data-screen=${screen}><${Screen} key=${screen} project=${project} go=${go} next=${next} /></div>
       </main>`;

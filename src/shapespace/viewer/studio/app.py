@@ -39,7 +39,15 @@ from shapespace.viewer.server import (
     json_response,
     whole_body,
 )
-from shapespace.viewer.studio.job_commands import QUESTIONS, Forms, checks, order, shapes_of
+from shapespace.viewer.studio.job_commands import (
+    QUESTIONS,
+    Forms,
+    Outdated,
+    checks,
+    order,
+    outdated_results,
+    shapes_of,
+)
 from shapespace.viewer.studio.jobs import Job, Jobs, Order, history
 from shapespace.viewer.studio.project import (
     PastedBlock,
@@ -64,6 +72,7 @@ class OpenProject:
 
     Args:
         folder: folder of the project.
+        forms: forms of the commands.
         create: whether to create the project.
         changed: function that is called after each change.
         upload_bytes: size limit of a scan.
@@ -71,8 +80,9 @@ class OpenProject:
     """
 
     def __init__(
-        self, folder: Path, *, create: bool, changed: Callable[[], None], upload_bytes: int, read_only: bool = False
-    ) -> None:
+        self, folder: Path, forms: Forms, *, create: bool, changed: Callable[[], None], upload_bytes: int,
+        read_only: bool = False,
+    ) -> None:  # fmt: skip
         self.project = Project.open(folder, create=create)
         self._resources = ExitStack()
         if not read_only:
@@ -80,6 +90,8 @@ class OpenProject:
         self.jobs = Jobs(self.project.folder, changed, read_only=read_only)
         self.checks = SpecimenChecks(self.project.folder, changed, self.project.exclude, read_only=read_only)
         self.views = Views(self._result, upload_bytes)
+        self._forms = forms
+        self._outdated: tuple[object, dict[int, Outdated]] = (None, {})
         for resource in (self.views, self.checks, self.jobs):
             self._resources.callback(resource.close)
 
@@ -94,7 +106,10 @@ class OpenProject:
 
     def facts(self) -> dict[str, Any]:
         """Return the state for the page."""
-        project, state = self.project, self.project.state
+        project, state, jobs = self.project, self.project.state, self.jobs.all()
+        key = (project.revision, [(job.number, job.status) for job in jobs])
+        if key != self._outdated[0]:
+            self._outdated = key, outdated_results(project, jobs, self._forms)
         specimens: list[dict[str, Any]] = []
         for specimen in state.specimens:
             facts = self.checks.facts(project.path(specimen)) or {
@@ -109,7 +124,7 @@ class OpenProject:
             "columns": list(state.columns), "specimens": specimens, "notes": state.notes(), "counts": state.counts(),
             "undo": project.undo_text, "redo": project.redo_text, "landmarks": state.landmarks,
             "landmarks_on": state.landmarks_on,
-            "jobs": [self._job(job) for job in self.jobs.all()],
+            "jobs": [self._job(job) for job in jobs],
         }  # fmt: skip
 
     def _job(self, job: Job) -> dict[str, Any]:
@@ -125,7 +140,7 @@ class OpenProject:
             "message": job.message, "progress": progress, "seconds": self.jobs.running_for(job), "left_s": left_s,
             "output": job.output, "options": job.options, "on": job.on,
             "views": [{"kind": kind, "href": href} for kind, href in zip(kinds, pages, strict=False)],
-            "sentences": sentences, "methods": methods,
+            "sentences": sentences, "methods": methods, "outdated": self._outdated[1].get(job.number),
         }  # fmt: skip
 
 
@@ -230,7 +245,12 @@ class Studio:
             if self._open is not None and self._open.project.folder == folder.resolve():
                 return
             opened = OpenProject(
-                folder, create=create, changed=self._changed, upload_bytes=self._upload_bytes, read_only=self._read_only
+                folder,
+                self._forms,
+                create=create,
+                changed=self._changed,
+                upload_bytes=self._upload_bytes,
+                read_only=self._read_only,
             )
             self.close()
             self._open = opened

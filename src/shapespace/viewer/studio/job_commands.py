@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+import csv
+import io
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any, Literal
 
-from shapespace.cohort.read import write_cohort_file
+from shapespace.cohort.read import cohort_file_text
 from shapespace.errors import InputError
 from shapespace.viewer.studio.jobs import Job, Order
 from shapespace.viewer.studio.project import Project, Specimen
@@ -25,7 +27,7 @@ def order(
     project: Project, jobs: Sequence[Job], forms: Forms, kind: str, options: Mapping[str, Any], on: int | None,
     number: int,
 ) -> Order:  # fmt: skip
-    """Return the command of a new job, and write the files that it reads.
+    """Return the command of a new job, with the files that it reads.
 
     Args:
         project: project with the specimens.
@@ -38,7 +40,6 @@ def order(
 
     Raises:
         InputError: it cannot be run: no such kind or option, or a result or specimens are missing.
-        FileError: the files cannot be written.
     """
     words = forms.get("correspond" if kind == "redo" else kind, {}).get("command", ())
     given = [] if kind == "redo" else _option_arguments(forms, kind, options)
@@ -46,9 +47,9 @@ def order(
     state, listed = project.state, f"{stem}.csv"
     if kind == "correspond":
         chosen = _require_specimens(state.chosen("training"), "to bring into correspondence", 2)
-        prepared = project.write_scans(folder / listed, chosen)
+        content, prepared = project.scan_list(folder / listed, chosen)
         output = f"correspondence-{number}"
-        return Order((*words, listed, "-o", output, *given), output, prepared)
+        return Order((*words, listed, "-o", output, *given), output, prepared, files={listed: content})
     if kind == "redo":
         before = result_of(jobs, CORRESPONDENCES, on)
         name = str(options.get("name", ""))
@@ -58,29 +59,29 @@ def order(
     if kind == "build":
         before = result_of(jobs, CORRESPONDENCES, on)
         output = f"model-{number}.h5"
-        marks: tuple[str, ...] = ()
+        marks, files = tuple[str, ...](), dict[str, str]()
         if state.landmarks and "--landmarks" not in options:
             if state.landmarks_on not in ("", before.output):
                 raise InputError(
                     f"The landmarks were placed on {state.landmarks_on}; place them on {before.output}, or remove them."
                 )
-            project.write_landmarks(folder / f"{stem}-landmarks.csv")
             marks = ("--landmarks", f"{stem}-landmarks.csv")
-        return Order((*words, *_surfaces(project, before), "-o", output, *marks, *given), output)
+            files[marks[1]] = project.landmark_table()
+        return Order((*words, *_surfaces(project, before), "-o", output, *marks, *given), output, files=files)
     if kind == "quality":
         output = f"quality-{number}"
         return Order((*words, result_of(jobs, CORRESPONDENCES, on).output, "-o", output, *given), output)
     if kind in ("fit", "complete"):
         model = result_of(jobs, ("build",), on).output
         chosen = _require_specimens(state.chosen("new"), "to fit; drop new scans", 1)
-        prepared = project.write_scans(folder / listed, chosen)
+        content, prepared = project.scan_list(folder / listed, chosen)
         output = f"{'fits' if kind == 'fit' else 'completed'}-{number}"
-        return Order((*words, model, listed, "-o", output, *given), output, prepared)
+        return Order((*words, model, listed, "-o", output, *given), output, prepared, files={listed: content})
     if kind == "report" and on is None:
         output = f"report-{number}/report.html"
-        project.write_table(folder / listed, state.specimens)
         results = [job.output for job in _results_of_study(jobs)]
-        return Order((*words, *results, "--specimens", listed, "-o", output, "--no-open", *given), output)
+        files = {listed: project.table(state.specimens)}
+        return Order((*words, *results, "--specimens", listed, "-o", output, "--no-open", *given), output, files=files)
     if kind == "report":
         before = result_of(jobs, (*CORRESPONDENCES, "fit"), on)
         return Order((*words, before.output, "--no-open", *given), f"{before.output}/report.html")
@@ -108,20 +109,23 @@ def _question(
     chosen = _specimens_of(project, shapes)
     if kind == "score":
         reference, others = _by_class(chosen, options.get("--reference"))
-        project.write_table(project.folder / f"{stem}.csv", _require_specimens(others, "to score", 1))
-        project.write_table(
-            project.folder / f"{stem}-reference.csv", _require_specimens(reference, "in the reference", 2)
-        )
-        population = project.folder / f"{stem}-reference.toml"
-        write_cohort_file(population, population.with_suffix(".csv"), shapes=project.folder / shapes.output)
+        reference_table, population = f"{stem}-reference.csv", f"{stem}-reference.toml"
+        inputs = project.folder / _INPUTS
+        files = {
+            f"{stem}.csv": project.table(_require_specimens(others, "to score", 1)),
+            reference_table: project.table(_require_specimens(reference, "in the reference", 2)),
+            population: cohort_file_text(
+                inputs, project.folder / reference_table, shapes=project.folder / shapes.output
+            ),
+        }
         given = [word for word in given if not word.startswith("--reference=")]
         return Order(
-            (*words, f"{stem}.csv", "--shapes", shapes.output, "--reference", f"{stem}-reference.toml", "-o", output,
-             *given),
-            output, on=shapes.number,
+            (*words, f"{stem}.csv", "--shapes", shapes.output, "--reference", population, "-o", output, *given),
+            output, on=shapes.number, files=files,
         )  # fmt: skip
-    project.write_table(project.folder / f"{stem}.csv", _require_specimens(chosen, "to analyse", 2))
-    return Order((*words, f"{stem}.csv", "--shapes", shapes.output, "-o", output, *given), output, on=shapes.number)
+    files = {f"{stem}.csv": project.table(_require_specimens(chosen, "to analyse", 2))}
+    arguments = (*words, f"{stem}.csv", "--shapes", shapes.output, "-o", output, *given)
+    return Order(arguments, output, on=shapes.number, files=files)
 
 
 def shapes_of(jobs: Sequence[Job], kind: str, on: int | None) -> Job:
@@ -186,9 +190,7 @@ def checks(
 ) -> list[dict[str, str]]:
     """Return findings on a question before it is run: a level (`ok`, `warning`, `problem`) and a sentence each."""
     chosen = _specimens_of(project, shapes)
-    formula = f"{options.get('--formula', '')} {options.get('--covariates', '')}"
-    used = {str(value) for value in options.values() if isinstance(value, str)}
-    columns = [column for column in project.state.columns if column in used or _in_formula(column, formula)]
+    columns = _used_columns(project.state.columns, options)
     missing = {column: sum(not specimen.cells.get(column) for specimen in chosen) for column in columns}
     of_all = len(chosen)
     drop_missing = options.get("--missing") == "drop"
@@ -224,6 +226,78 @@ def checks(
         if option["required"] and not options.get(option["flag"]):
             found.append({"level": "problem", "text": f"Choose: {option['help'].partition(';')[0]}."})
     return found
+
+
+Outdated = Literal["specimens", "table", "landmarks", "redone", "source"]
+"""What changed since a result was computed: the specimens or their scans, columns of the table that it uses, the
+landmarks, the correspondence, in which a scan was registered again, or a result that it was computed from."""
+
+
+def outdated_results(project: Project, jobs: Sequence[Job], forms: Forms) -> dict[int, Outdated]:
+    """Return what changed since results were computed, by the numbers of their jobs; other results are up to date.
+
+    A result is up to date if the command for the same choices, with the same source, and the files that it would read
+    are those of its job; of tables only the columns count that it uses.
+    """
+    found: dict[int, Outdated] = {}
+    done = [job for job in jobs if job.status == "done"]
+    for job in done:
+        earlier = [other for other in done if other.number < job.number]
+        sources = [other for other in earlier if other.output in job.arguments]
+        redone = [other.output for other in done if other.kind == "redo" and other.number > job.number]
+        if (
+            job.kind in _STUDY
+            and job.kind != "redo"
+            and (change := _change_since(project, earlier, forms, job, sources))
+        ):
+            found[job.number] = change
+        elif any(output in job.arguments and output != job.output for output in redone):
+            found[job.number] = "redone"
+        elif any(source.number in found for source in sources):
+            found[job.number] = "source"
+    return found
+
+
+def _change_since(
+    project: Project, earlier: Sequence[Job], forms: Forms, job: Job, sources: Sequence[Job]
+) -> Outdated | None:
+    on = job.on if job.on is not None or not sources else sources[-1].number
+    try:
+        now = order(project, earlier, forms, job.kind, job.options, on, job.number)
+    except InputError:
+        return "specimens"
+    if (now.arguments, now.before) != (job.arguments, job.before):
+        has_marks = ["--landmarks" in arguments for arguments in (now.arguments, job.arguments)]
+        return "landmarks" if has_marks[0] != has_marks[1] else "specimens"
+    used = {"id", "file"} if now.before or job.kind in ("correspond", "fit", "complete") else {
+        "specimen", *_used_columns(project.state.columns, job.options)
+    }  # fmt: skip
+    for name, content in now.files.items():
+        try:
+            before = (project.folder / name).read_text(encoding="utf-8")
+        except OSError:
+            continue  # whoever removed it knows
+        if name.endswith("-landmarks.csv"):
+            if content != before:
+                return "landmarks"
+        elif name.endswith(".csv") and (rows := _rows_of(content, used)) != (rows_before := _rows_of(before, used)):
+            return "table" if [row[:1] for row in rows] == [row[:1] for row in rows_before] else "specimens"
+    return None
+
+
+def _rows_of(table: str, columns: Collection[str]) -> list[list[str]]:
+    """Return the rows of a table with some of its columns, sorted."""
+    header, *rows = csv.reader(io.StringIO(table))
+    kept = [k for k, name in enumerate(header) if name in columns]
+    return sorted([row[k] for k in kept] for row in rows)
+
+
+def _used_columns(columns: Sequence[str], options: Mapping[str, Any]) -> list[str]:
+    """Return the columns of the table that the options of a question name."""
+    formula = f"{options.get('--formula', '')} {options.get('--covariates', '')}"
+    texts = [value for value in options.values() if isinstance(value, str)]
+    used = {part for text in texts for part in (text, text.partition("=")[0], *text.split(","))}
+    return [column for column in columns if column in used or _in_formula(column, formula)]
 
 
 def _in_formula(column: str, formula: str) -> bool:

@@ -8,7 +8,7 @@ import shlex
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -75,12 +75,24 @@ class Order:
         output: path of the result, relative to the folder.
         before: arguments of the commands that write its input, in order.
         on: number of the job whose shapes a question is about.
+        files: path in the project's folder -> content of the files that the commands read.
     """
 
     arguments: tuple[str, ...]
     output: str
     before: tuple[tuple[str, ...], ...] = ()
     on: int | None = None
+    files: Mapping[str, str] = field(default_factory=dict[str, str])
+
+    def write_files(self, folder: Path) -> None:
+        """Write the files that the commands read into the project's folder.
+
+        Raises:
+            FileError: they cannot be written.
+        """
+        for name, content in self.files.items():
+            make_folder((folder / name).parent)
+            write_text(folder / name, content)
 
 
 class Jobs:
@@ -132,10 +144,14 @@ class Jobs:
             kind: kind of the command.
             make: function that returns its command, given its number and the earlier jobs.
             options: flag -> value, as the user chose them.
+
+        Raises:
+            FileError: its files cannot be written.
         """
         with self._lock:
             number = max(self._jobs, default=0) + 1
             made = make(number, self.all())
+            made.write_files(self._folder.parent)
             job = Job(
                 number=number, kind=kind, arguments=made.arguments, output=made.output, before=made.before,
                 options=dict(options or {}), on=made.on,

@@ -327,15 +327,13 @@ class Project:
 
     # Files that commands read
 
-    def write_scans(self, path: Path, specimens: Sequence[Specimen]) -> tuple[tuple[str, ...], ...]:
-        """Write a list of scans with their ids and cells, as `correspond` and `fit` read it.
+    def scan_list(self, path: Path, specimens: Sequence[Specimen]) -> tuple[str, tuple[tuple[str, ...], ...]]:
+        """Return a list of scans with their ids and cells, as `correspond` and `fit` read it, and the commands that
+        write scans in mm and their mirror images, whose output the list names.
 
         Args:
             path: path of the list, in a folder of the project.
             specimens: specimens of the list.
-
-        Returns:
-            The commands that write scans in mm and their mirror images; the list names their output.
         """
         columns, commands = self.state.columns, list[tuple[str, ...]]()
         files = {specimen.id: _relative(self.path(specimen), path.parent) for specimen in specimens}
@@ -353,22 +351,17 @@ class Project:
             (specimen.id, files[specimen.id], *(specimen.cells.get(column, "") for column in columns))
             for specimen in specimens
         ]
-        self._write_table(path, ("id", "file", *columns), rows)
-        return tuple(commands)
+        return table_text(("id", "file", *columns), rows), tuple(commands)
 
-    def write_table(self, path: Path, specimens: Iterable[Specimen]) -> None:
-        """Write the table of specimens, as `compare` reads it."""
+    def table(self, specimens: Iterable[Specimen]) -> str:
+        """Return the table of specimens, as `compare` reads it."""
         columns = self.state.columns
         rows = [(specimen.id, *(specimen.cells.get(column, "") for column in columns)) for specimen in specimens]
-        self._write_table(path, ("specimen", *columns), rows)
+        return table_text(("specimen", *columns), rows)
 
-    def write_landmarks(self, path: Path) -> None:
-        """Write the landmarks as a table of name and vertex."""
-        self._write_table(path, ("name", "vertex"), list(self.state.landmarks.items()))
-
-    def _write_table(self, path: Path, header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
-        make_folder(path.parent)
-        write_text(path, table_text(header, rows))
+    def landmark_table(self) -> str:
+        """Return the landmarks as a table of name and vertex."""
+        return table_text(("name", "vertex"), list(self.state.landmarks.items()))
 
 
 class MatchedBlock(Struct, frozen=True, kw_only=True):
