@@ -33,6 +33,24 @@
   nameButton();
   button.hidden = false;
 
+  // In the studio: its theme, and of an answer first what turns; the sentences are above the report already.
+  if (root.classList.contains("in-studio")) {
+    window.addEventListener("message", (event) => {
+      if (event.source !== window.parent || !["light", "dark"].includes(event.data && event.data.theme)) return;
+      root.dataset.theme = event.data.theme;
+      tellTheme();
+    });
+  }
+  if (root.classList.contains("answer")) {
+    const list = document.querySelector("nav ul"), main = document.getElementById("content");
+    const isMap = (item) => document.getElementById(item.firstElementChild.hash.slice(1)).parentElement.querySelector(".turning") !== null;
+    const items = Array.from(list.children), maps = items.filter(isMap);
+    for (const item of maps.concat(items.filter((other) => !maps.includes(other)))) {
+      list.append(item);
+      main.append(document.getElementById(item.firstElementChild.hash.slice(1)).parentElement);
+    }
+  }
+
   // Tables: numbers by their value, texts as people order them; rows without a number stay last.
   const collator = new Intl.Collator(undefined, { numeric: true, sensitivity: "base" });
   function key(row, column) {

@@ -190,12 +190,14 @@
   function ResultFrame({ job, frame }) {
     const [at, setAt] = useState(0);
     const view = job.views[Math.min(at, job.views.length - 1)];
+    // A report takes the theme from its address, and later ones from messages, as it is a document apart.
+    const address = useMemo(() => (view && view.kind === "report" ? `${view.href}#in-studio-${Studio.theme()}${job.sentences.length ? "-answer" : ""}` : view && view.href), [view && view.href]);
     if (!view) return html`<${Summary} job=${job} />`;
     const sandbox = view.kind === "report" ? "allow-scripts allow-downloads allow-popups" : undefined;
     return html`
       <div class="frame" data-testid=${`result-${job.number}`}>
         ${job.views.length > 1 && html`<div class="segments" role="group" aria-label=${J.view}>${job.views.map((one, k) => html`<button type="button" aria-pressed=${k === at} data-testid=${`view-${one.kind}`} onclick=${() => setAt(k)}>${J.views[one.kind]}</button>`)}</div>`}
-        <iframe key=${view.href} ref=${frame} src=${view.href} sandbox=${sandbox} data-testid="frame" title=${J.frame(J.views[view.kind] || view.kind, job.output)}></iframe>
+        <iframe key=${view.href} ref=${frame} src=${address} sandbox=${sandbox} data-testid="frame" title=${J.frame(J.views[view.kind] || view.kind, job.output)}></iframe>
       </div>`;
   }
 

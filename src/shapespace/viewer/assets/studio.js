@@ -16,6 +16,8 @@
   const KINDS = { correspondence: ["correspond", "redo"], model: ["build", "quality", "morphospace"], fit: ["fit", "complete"], questions: Studio.QUESTIONS, export: ["report", "convert", "export", "figures"] };
   const AFTER = { specimens: "correspondence", correspondence: "model", model: "questions", fit: "questions", questions: "export" };
 
+  Studio.theme = () => document.documentElement.dataset.theme || (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
+
   const ofAddress = () => (NAMES.includes(location.hash.slice(1)) ? location.hash.slice(1) : NAMES[0]);
 
   /** Whether a screen's jobs run or have succeeded. */
@@ -92,6 +94,7 @@
     Viewer.startMessages();
     Viewer.startTheme(() => {
       // Pages in frames take the theme when they are loaded; their own button, which is hidden there, switches it later.
+      for (const frame of document.querySelectorAll("iframe[sandbox]")) frame.contentWindow.postMessage({ theme: Studio.theme() }, "*");
       for (const frame of document.querySelectorAll("iframe:not([sandbox])")) frame.contentDocument.getElementById("theme")?.click();
     });
     addEventListener("keydown", shortcut);
