@@ -244,7 +244,10 @@ def _read_scans(target: _QualityInput, folder: Path | None, *, quiet: bool) -> l
             bar.update()
     for scan in out:
         if not len(scan.vertices) or not np.isfinite(scan.vertices).all():
-            raise MeshError(f"{scan.name}: its vertices are missing or not finite, so nothing can be judged by it.")
+            raise MeshError(
+                f"{scan.name}: its vertices are missing or not finite, so it cannot evaluate a model; "
+                "repair or remove it."
+            )
     return out
 
 

@@ -249,7 +249,7 @@ class RegistrationState:
         return bool(self.relief_agreement.get(i, 0.0) < usual - by)
 
     def is_mirrored(self, i: int) -> bool:
-        """Return whether scan `i` is a mirror image of the majority, as far as known."""
+        """Return whether scan `i` is a mirror image of the majority, by its registration or the comparisons."""
         if i in self.registrations:
             return self.registrations[i].mirrored
         return bool(self.sides.mirrored[i])
@@ -307,7 +307,7 @@ def _decide_sides(problem: _RunConstants, run: Runner, *, may_reflect: bool) -> 
 def _compare_with_anchor(
     problem: _RunConstants, context: RoundContext, anchor: int, run: Runner
 ) -> tuple[_RunConstants, FloatArray]:
-    """Return the problem with the comparisons of all scans with an anchor, and the scores (N, 2) of both sides."""
+    """Return the problem with the comparisons of all scans with an anchor, and scores (N, 2), as given and mirrored."""
     sides: Comparison = "pose" if problem.config.mirror == "never" else "scores"
     tasks = [
         RegistrationTask(i, scan, None, None, problem.config.first, sides=sides)
@@ -984,7 +984,7 @@ def _complete_shapes(problem: _RunConstants, state: RegistrationState) -> dict[i
     """Return the vertices (V, 3) of each registered scan, in the template's frame, with estimates where not observed.
 
     An estimate is the conditional mean by probabilistic PCA of all registered scans (C27). A vertex that fewer than
-    `FEWEST` scans observe, and any vertex of too few scans for a model, keeps its registered position.
+    `FEWEST` scans observe keeps its registered position. If there are too few scans for a model, all vertices do.
     """
     order = sorted(state.registrations)
     shapes, weights = state.shapes(order)

@@ -108,7 +108,7 @@ class Kinds:
     """The kinds of object of a collection.
 
     Args:
-        groups: indices of the shapes that are alike, largest group first; shapes in no group are missing.
+        groups: indices of the shapes of each group of similar shapes, largest group first; some shapes are in no group.
         distance: (N,) distances from the prediction by the largest group, relative to the median of the group.
         relief_agreement: (N,) agreement with the median relief of the largest group (C35); not-a-number if unknown.
     """
@@ -167,7 +167,7 @@ class Collection:
 
     @staticmethod
     def of(shapes: FloatArray, observed: FloatArray, template: FloatArray) -> Collection:
-        """Return a collection at `_POINTS` of the vertices, drawn at random."""
+        """Return the collection of `shapes` at `_POINTS` of their vertices, which are drawn at random."""
         chosen = np.sort(np.random.default_rng(0).permutation(len(template))[:_POINTS])
         return Collection(shapes[:, chosen], observed[:, chosen], template[chosen])
 

@@ -289,7 +289,11 @@ class MarkedSpecimens:
 
 
 def _find_swapped(apart: FloatArray) -> dict[int, int]:
-    """Return index -> index of landmarks whose names are exchanged, from (L, L) distances of given from predicted."""
+    """Return index -> index of landmarks whose names are exchanged.
+
+    Args:
+        apart: (L, L) distance of each given landmark (row) from each predicted landmark (column).
+    """
     straight = apart.diagonal()[:, None] + apart.diagonal()[None]
     ratio = np.where(straight > 0, (apart + apart.T) / np.maximum(straight, 1e-300), 1.0)
     np.fill_diagonal(ratio, 1.0)

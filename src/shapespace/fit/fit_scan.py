@@ -88,7 +88,7 @@ class RegionFit:
         return model.landmarks.within(self.part.inside)
 
     def fitted(self, fitted: Fitted, modes: int | None) -> Fitted:
-        """Return the end of the fit with the first `modes` coefficients of the complete model, None for all."""
+        """Return the end of the fit for the complete model, with its first `modes` coefficients; None for all."""
         from shapespace.fit.robust.posterior import variance_of_new_shapes  # compiled, and loads SciPy
 
         full, part, k = self.full, self.part, modes

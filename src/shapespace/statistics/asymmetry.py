@@ -709,7 +709,10 @@ def _scores(fields: FloatArray, subjects: _Subjects, shared: FloatArray | None) 
 
 
 def _standardise(scores: AsymmetryScores, group: npt.NDArray[np.bool_]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return z, low and high (n,) of scores against those of the group; a member is compared with the other members."""
+    """Return z (n,) of the scores, and of the lower and upper ends of their intervals, relative to the group's scores.
+
+    A member of the group is compared with the other members.
+    """
     inside = scores.mm[group]
     n, total, square = len(inside), inside.sum(), (inside**2).sum()
     less = group.astype(np.float64)

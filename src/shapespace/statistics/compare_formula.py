@@ -64,9 +64,10 @@ class Variable:
         name: name of the column; in C() if its numbers denote classes.
         column: internal name of the column.
         levels: classes in order; empty for numbers.
-        groups: classes whose sizes and dispersion count: the levels, or both values of numbers that have only two.
-        low: 5th percentile of numbers; the smaller of two values.
-        high: 95th percentile of numbers; the larger of two values.
+        groups: classes whose sizes and dispersions are checked: the levels, or the two values of a column of numbers
+            with only two; empty for other numbers.
+        low: 5th percentile of numbers, or the smaller value if there are only two.
+        high: 95th percentile of numbers, or the larger value if there are only two.
         middle: mean of numbers.
     """
 

@@ -452,7 +452,10 @@ def _no_effect_error(effect: frozenset[str], design: Design) -> InputError:
 
 
 def _cells(design: Design, who: Rows, varying: set[str]) -> tuple[Rows, Rows]:
-    """Return a row of each cell, in the order of the table, and the (N,) cell of each row."""
+    """Return the first row of each cell, in the order of the table, and the (N,) cell of each row.
+
+    A cell consists of the rows of one subject (`who`) that are equal in all `varying` variables.
+    """
     values = [design.values[name] for name in sorted(varying)]
     numbers: dict[tuple[object, ...], int] = {}
     rows, cell = list[int](), list[int]()

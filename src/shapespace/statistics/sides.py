@@ -73,8 +73,9 @@ class Sides:
     def chord_heights(self, mean: FloatArray, normals: FloatArray) -> FloatArray:
         """Return the height (M,) of the curved surface above its triangle at the mirror image of each vertex.
 
-        Each vertex lies on the surface, and would seem to be further out than the other side. Near the plane, where
-        sides hardly vary, this would look like directional asymmetry. The height is exact for quadratic surfaces: half
+        A vertex is on the curved surface, but its mirror image is interpolated on a flat triangle, below the surface.
+        Without this height the vertex would seem to be further out than the other side. Near the mirror plane, where
+        sides hardly vary, that would look like directional asymmetry. The height is exact for quadratic surfaces: half
         of the projection of Boubekeur and Alexa (Phong tessellation, 2008).
 
         Args:

@@ -519,7 +519,7 @@ def _wider_than_three(axis: Any) -> float:
 def _stack_coefficients(scans: Sequence[Coefficients]) -> FloatArray:
     """Return the coefficients of all scans, (n, K) mm."""
     if not scans:
-        raise InputError("There is nothing to draw of coefficients without scans.")
+        raise InputError("There are no scans, so there are no coefficients to draw.")
     if len({scan.b.shape for scan in scans}) > 1:
         raise InputError("The scans have different numbers of coefficients, so they were fitted by different models.")
     return np.stack([scan.b for scan in scans])

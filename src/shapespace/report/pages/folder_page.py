@@ -181,7 +181,7 @@ class FolderPage:
         return self._cards | self._details
 
     def place_of(self, name: str) -> str | None:
-        """Return the place in the page of a fit, or None."""
+        """Return the place of the fit `name` in the page; None if the page does not show it."""
         return (self._details | self._cards).get(printable(name))
 
     def model_part(self) -> list[Block]:

@@ -85,7 +85,7 @@ def compare_trajectories(
     stages = order or tuple(sorted(set(texts), key=float if cohort.table.kind(points) == "number" else str))
     if set(stages) != set(texts) or len(stages) < 2 or len(set(stages)) < len(stages):
         raise InputError(
-            f"{cohort.table.where}: a trajectory needs two or more different points, each class of {points!r} once, "
+            f"{cohort.table.where}: a trajectory needs two or more points: each class of {points!r} exactly once, "
             f"not {', '.join(stages)[:80]}."
         )
     g, p = len(groups.names), len(stages)

@@ -50,7 +50,7 @@ def plan_sample_size(
             the root mean square over all pairs.
         sizes: numbers of shapes in each group.
         simulations: number of simulated studies for each size.
-        permutations: number of permutations in the test of each, including the simulated data.
+        permutations: number of permutations in the test of each simulated study, including its data as simulated.
         seed: seed of the simulations.
         drop_missing: exclude shapes with missing values in the table (default: an error).
         progress: function called with (done, total).
