@@ -421,7 +421,7 @@ class Cohort:
             if shapes.shape[1] != onto.n_vertices:
                 noun = "landmarks" if onto.source.kind == "landmarks" else "vertices"
                 raise InputError(
-                    f"Shapes of {shapes.shape[1]} {noun} cannot be compared with those of {onto.n_vertices}."
+                    f"Shapes of {shapes.shape[1]} {noun} cannot be compared with shapes of {onto.n_vertices} {noun}."
                 )
             if analysed is not None:
                 mask = None if is_observed[:, analysed].all() else np.logical_and(is_observed, analysed)

@@ -60,7 +60,8 @@ class BuildFilesConfig:
         landmarks: landmarks of the model: points on the first mesh in any landmark format, a CSV of name,vertex, or
             `landmarks.csv` of correspond (default: landmarks.csv next to the first mesh, otherwise those of the model
             of fitted surfaces).
-        regions: name -> file with its vertices of the meshes, kept in the model for fits that are restricted to one.
+        regions: name -> file with the vertices of this region of the meshes. The model stores the regions, and fits can
+            be restricted to a region.
         labels: separate identity and expression: CSV of file, subject and label, with a neutral face of each subject;
             the number of modes then counts modes of identity (`auto`: 0.995 of the variance).
         expression_variance: share of the expression variance that the expression modes explain, for a model of identity

@@ -403,7 +403,7 @@ class CorrespondenceFolder:
 
     @contextlib.contextmanager
     def writing(self) -> Generator[CorrespondenceFolder]:
-        """Yield the folder, into which no other run writes during the block, and in which no change is incomplete.
+        """Yield the folder, locked against other writing runs, after an interrupted change of it was completed.
 
         Raises:
             FileError: another run writes into the folder, or files cannot be moved.

@@ -110,8 +110,8 @@ def quality(
         targets: models, or folders of meshes in correspondence.
         output: the folder to write to.
         config: folds, modes, samples, seed and gauge.
-        options: what to measure.
-        execution: Executor of folds and random shapes.
+        options: measures and the data that they need.
+        execution: executor of the folds and of the random shapes.
         quiet: no progress.
 
     Raises:
@@ -151,7 +151,7 @@ def quality(
 
 
 def quality_lines(quality: Quality) -> list[str]:
-    """Return the measures with most modes, in words."""
+    """Return one line for each measure at its largest number of modes."""
     out: list[str] = [quality.name]
     for key, unit in _UNITS.items():
         measure = getattr(quality, key)

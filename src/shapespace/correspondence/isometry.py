@@ -209,7 +209,7 @@ def _refine_map(template: IntrinsicShape, scan: IntrinsicShape, start: IntArray,
 
 
 def _orientation(shape: FloatArray, faces: IntArray, normals: FloatArray) -> float:
-    """Return the share of the area of `shape` that faces as the scan does, less that of the rest.
+    """Return the share of the area of `shape` whose normals agree with those of the scan, minus the remaining share.
 
     Args:
         shape: (V, 3) vertices on the scan.

@@ -418,7 +418,7 @@ class _Recorder:
             )
 
     def driven(self, fitted: Fitted) -> _MethodRun:
-        """Return the run of the method: the recorded states, and `fitted` as their end."""
+        """Return the run of the method, from its recorded states and its end `fitted`."""
         return _MethodRun(self._history, self._ended, self._phase_2_from, fitted)
 
 
@@ -523,7 +523,7 @@ def _note_no_triangles(scan: Mesh) -> list[str]:
 
 
 def _note_large_coefficients(model: ShapeModel, b: FloatArray) -> list[str]:
-    """Note that more coefficients are large than by chance; without a prior faint modes follow details of the scan."""
+    """Return a note if more coefficients are large than by chance; without a prior, faint modes follow scan details."""
     far = int((np.abs(b) > _FAR_OUT * model.stddev[: len(b)]).sum())
     if far <= 1 + _FAR_OUT_BY_CHANCE * len(b):
         return []

@@ -396,9 +396,9 @@ def _align_training_shapes(
 
 
 def _components_of_codes(coder: Representation, shapes: FloatArray, modes: Modes, seed: int) -> PrincipalComponents:
-    """Return mean and basis in codes, orthonormal in the vertices that they decode to; `shapes` is overwritten.
+    """Return mean and basis as codes, for example control points; the basis is orthonormal after decoding to vertices.
 
-    The variation that coding loses counts as variance outside the modes.
+    `shapes` is overwritten. Variation that the codes cannot represent counts as variance outside the modes.
     """
     centre = shapes.mean(axis=0)
     total = sum(float(((shape - centre) ** 2).sum()) for shape in shapes) / (len(shapes) - 1)

@@ -102,7 +102,7 @@ class ModelQuality:
     """Quality measures of a shape model; None if the shapes or the model do not determine a measure.
 
     Args:
-        compactness: shares of the variance; the interval is by jackknife over shapes, none for a model alone.
+        compactness: shares of the variance. The interval is from a jackknife over shapes, so a model alone has none.
         generalisation: errors of held-out shapes, mm, surface to surface.
         generalisation_vertices: errors of held-out shapes, mm, vertex to vertex.
         specificity: distances of random shapes, mm, surface to surface.
@@ -576,7 +576,11 @@ def _spread_indices(vertices: int) -> IntArray:
 
 
 def _errors_by_modes(model: ShapeModel, target: _Target, counts: IntArray, *, surface: bool = True) -> FloatArray:
-    """Return the distances (n, 2), mm, of a shape from its reconstructions by the first modes: vertices, surface."""
+    """Return the distances (n, 2), mm, of a shape from its reconstructions by the first `counts` (n,) modes.
+
+    The columns are the mean distance between corresponding vertices and the distance from surface to surface; the
+    second is 0 without `surface`.
+    """
     there, out = target.shape.vertices[target.seen], np.zeros((len(counts), 2))
     T_model_shape = _onto_mean(model, target)
     for column, k in enumerate(counts):

@@ -290,7 +290,7 @@ class ShapeModel:
 
     @cached_property
     def _modes(self) -> FloatArray:
-        """The basis transposed, (K, D): with each mode in one piece both of its products run at memory speed."""
+        """The transposed basis, (K, D), which is contiguous for each mode, so that products with it are fast."""
         return np.ascontiguousarray(self.basis.T)
 
     @cached_property

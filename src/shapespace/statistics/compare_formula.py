@@ -392,7 +392,7 @@ def _parse_terms(formula: str, table: Table) -> list[list[_Factor]]:
     unquoted = next((name for name in odd if name in _QUOTED.sub("", right)), None)
     advice = "write one such as '~ sex + age'" if unquoted is None else f"write {quoted(unquoted)} with its backticks"
     if "~" in plain:
-        raise InputError(f"{where} has something before ~ or a second one; shape is the response, so write '~ sex'.")
+        raise InputError(f"{where} has something before ~, or a second ~; shape is the response, so write '~ sex'.")
     if len(formula) > _LONGEST or stars > _MOST_STARS or powers > 1 or len(re.findall(r"\w+", plain)) > _MOST_NAMES:
         raise InputError(f"{where} is too long; write a shorter one.")
     if not _PLAIN.fullmatch(plain) or re.search(r"(\*\*|\^)(?!\s*[23]\b)", plain):

@@ -113,7 +113,7 @@ class Sides:
 
 
 def find_sides(cohort: Cohort) -> Sides:
-    """Return the sides of an object from the mean of its cohort, or from the mean of the model of fits.
+    """Return the sides of an object from the mean of its cohort, or of the model if the cohort consists of fits.
 
     Raises:
         InputError: it has no triangles, or it is not symmetric about any plane.

@@ -697,7 +697,7 @@ def described(cls: type) -> dict[str, str]:
 
 
 def _numbers(key: str, values: Mapping[str, Any], part_name: str) -> list[Block]:
-    """Return the settings of one part of the fit as tables of words."""
+    """Return tables of the settings of one part of the fit, with their meaning."""
     out: list[Block] = []
     rows: list[list[str]] = [
         ["all" if step.get(name) is None else _level(name, step[name]) for name in _LEVEL]

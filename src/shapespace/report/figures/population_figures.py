@@ -140,9 +140,9 @@ def density_figure(z: npt.NDArray[np.floating[Any]], distances: FloatArray, *, t
     """Draw the density of fits in the first coefficients, and of their distance from the mean.
 
     Args:
-        z: (n, K) in standard deviations.
-        distances: (n,) their root mean square.
-        title: above the figure.
+        z: (n, K) coefficients of the fits, in standard deviations.
+        distances: (n,) root mean square of the coefficients of each fit.
+        title: title of the figure.
 
     Raises:
         InputError: fewer than two coefficients.

@@ -241,7 +241,7 @@ def _results(folder: Folder) -> Results:
 
 
 def saved_fit(folder: Folder, results: Results, name: str) -> SavedFit:
-    """Return one fit of `results`, which belong to `folder`; `unreadable` if it cannot be read."""
+    """Return the fit `name` of `results`, which belong to `folder`; its status is `unreadable` if it cannot be read."""
     fitted, dense, stages = (
         f"{name}{ENDINGS[kind]}" if results.has(name, kind) else None for kind in ("fitted", "dense", "stages")
     )

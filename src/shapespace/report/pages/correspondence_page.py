@@ -361,7 +361,7 @@ class CorrespondencePage:
     # The scans
 
     def scans(self) -> list[Block]:
-        """Return the gallery, the worst first, and the table of all."""
+        """Return the gallery of scans, the worst first, and the table of all scans."""
         return [
             self.page.section(
                 (

@@ -502,7 +502,9 @@ def discriminate(
 
 
 def _within_products(means: FloatArray, shape: FloatArray, counts: Orders) -> FloatArray:
-    """Return the products (b, G, G + 1) of group means with each other and a shape, by the scatter within.
+    """Return the inner products (b, G, G + 1) of the group means with each other, and last with a shape.
+
+    The metric is the inverse of the scatter within groups.
 
     Args:
         means: (b, G, q) means of the groups, in coordinates with a mean of 0 and the identity as total scatter.

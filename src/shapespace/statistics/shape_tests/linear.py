@@ -510,7 +510,7 @@ def _models(cohort: Cohort, formula: str, null: str | None) -> tuple[Design, Flo
 
 
 def _mean_estimator(design: Design, indicator: FloatArray) -> FloatArray:
-    """Return the (G, N) estimator of least-squares means of groups (N, G), with numbers at their mean (M30)."""
+    """Return the (G, N) estimator of least-squares means of groups, with numeric covariates at their mean (M30)."""
     n = len(indicator)
     values = {v.column: design.values[v.column] if v.levels else [v.middle] * n for v in design.variables}
     rows = indicator.T @ _with_constant(design.rows(values)) / indicator.sum(axis=0)[:, None]

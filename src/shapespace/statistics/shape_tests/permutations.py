@@ -101,7 +101,10 @@ class Groups:
         return (values - means_of(values, self.codes)[self.codes]) * np.sqrt(counts / (counts - 1))
 
     def resamples(self, draws: int, seed: int) -> FloatArray:
-        """Return how often each shape is drawn (draws, N) in bootstrap samples of each group; first, each once."""
+        """Return how often each shape is drawn (draws, N) in bootstrap samples within each group.
+
+        The first sample contains each shape once.
+        """
         rng = np.random.default_rng([seed, _STREAM, _RESAMPLES])
         counts = np.ones((draws, len(self.codes)))
         for g, n in enumerate(self.counts.tolist()):

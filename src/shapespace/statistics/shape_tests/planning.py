@@ -167,7 +167,7 @@ def _simulator(
 
 
 def _smallest_size(sizes: tuple[float, ...], powers: tuple[float, ...]) -> int | None:
-    """Return the size for the planned power; None if it is outside the sizes."""
+    """Return the smallest sample size with the planned power; None if it is not within the range of `sizes`."""
     if not powers[0] < _POWER <= max(powers):
         return None
     # The probit of the power is nearly linear in the root of the size.
