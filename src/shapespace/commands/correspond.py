@@ -231,7 +231,7 @@ def _subjects_of(jobs: Sequence[FitJob], column: str | None) -> dict[str, str]:
     if missing := [name for name, subject in subjects.items() if not subject]:
         raise InputError(
             f"The column {column} of --subjects has no value for {len(missing)} of {len(jobs)} scans "
-            f"({first_names(missing, _LISTED)}); fill it in, or leave these scans out."
+            f"({first_names(missing, _LISTED)}); fill it in, or exclude these scans."
         )
     return subjects
 

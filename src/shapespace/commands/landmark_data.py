@@ -98,7 +98,7 @@ def check_landmarks(
 
         return check_marked(marked, scans, output, say=say)
     if output is not None:
-        raise InputError("-o goes with SAME, the folder that correspond wrote; leave it out.")
+        raise InputError("-o goes with SAME, the folder that correspond wrote; omit -o.")
     raw = read_configurations(marked, sliders=sliders)
     absent = ~raw.observed
     findings = [*_duplicates(raw), *find_other_scales(raw)]
@@ -140,7 +140,9 @@ def _duplicates(raw: LandmarkConfigurations) -> list[str]:
             together[before, label] += before != label
     for (earlier, later), count in together.most_common():
         if count:
-            findings.append(f"Landmarks {earlier} and {later} are at one place in {count} of {len(raw)} specimens.")
+            findings.append(
+                f"Landmarks {earlier} and {later} are at the same place in {count} of {len(raw)} specimens."
+            )
     return findings
 
 

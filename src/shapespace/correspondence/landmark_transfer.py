@@ -195,7 +195,9 @@ class MarkedSpecimens:
         target = next((i for i, mesh in enumerate(self.surfaces) if mesh.name == specimen), None)
         sources = {i: marks for i, marks in self.landmarks.items() if i != target}
         if target is None or not sources:
-            raise InputError(f"{specimen}: no surface has this name, or no other specimen is marked; mark another one.")
+            raise InputError(
+                f"{specimen}: no surface has this name, or no other specimen is marked; mark another specimen."
+            )
         surface = self.surfaces[target]
         size = rms_size(surface.vertices)
         names = [name for name in self.names if any(name in marks.names for marks in sources.values())]

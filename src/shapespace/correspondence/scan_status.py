@@ -96,7 +96,7 @@ def judge(evidence: SurfaceEvidence) -> Judgement:
         doubt = "its limbs may be exchanged: another assignment of its limbs agrees nearly as well"
     elif consensus:
         doubt = (
-            "its pose may be wrong: the comparisons with other scans agree on one that is rotated by "
+            "its pose may be wrong: the comparisons with other scans agree on a pose that is rotated by "
             f"{evidence.consensus_deg:.0f} degrees"
         )
     else:

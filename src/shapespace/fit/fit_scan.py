@@ -529,7 +529,8 @@ def _note_large_coefficients(model: ShapeModel, b: FloatArray) -> list[str]:
         return []
     return [
         f"{far} of {len(b)} coefficients lie over {_FAR_OUT:g} standard deviations out; the faint modes follow "
-        "details of the scan that the model does not contain; build it with fewer modes (--modes) for plausible ones."
+        "details of the scan that the model does not contain; build the model with fewer modes (--modes) for plausible "
+        "coefficients."
     ]
 
 

@@ -440,7 +440,7 @@ def _check_variation(shapes: FloatArray) -> None:
     """Raise if training shapes have no extent or no variation, before alignment turns rounding into modes."""
     spread = float((np.nanmax(shapes, axis=0) - np.nanmin(shapes, axis=0)).max())
     if spread <= 64 * np.finfo(float).eps * float(np.nanmax(np.abs(shapes))):
-        raise InputError("The training meshes are all equal, so there is no variation to model; give different ones.")
+        raise InputError("The training meshes are all equal, so there is no variation to model; give different meshes.")
 
 
 _ROUNDS = 5  # iterations of spline and alignment to fill holes

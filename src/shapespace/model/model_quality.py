@@ -695,7 +695,7 @@ def _more_shapes(by_shapes: Curve, seed: int) -> str:
     now = 100 * float(1 - each[:, -1].mean() / each[:, few].mean())
     low, high = 100 * np.percentile(fell, [2.5, 97.5])
     changed = f"fell by {now:.0f} %" if now >= 0 else f"rose by {-now:.0f} %"
-    sentence = f"From {counts[few]} to {counts[-1]} training shapes the error on unseen ones {changed} "
+    sentence = f"From {counts[few]} to {counts[-1]} training shapes the error on unseen shapes {changed} "
     sentence += f"(95 %: {low:.0f} to {high:.0f} %), "
     if low > 0 and now >= 5:
         return sentence + "so more shapes would help."

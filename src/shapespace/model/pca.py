@@ -38,7 +38,7 @@ _NO_VARIANCE = 1e-10
 _ROUNDING, _NO_VARIATION = 64 * float(np.finfo(float).eps), 1e-12
 """Largest difference of coordinates of equal shapes as a share of their size, and for shapes on a disk the share of the
 sum of squares that is rounding error."""
-ALL_EQUAL = "The training shapes are all equal, so there is no variation to model; give different ones."
+ALL_EQUAL = "The training shapes are all equal, so there is no variation to model; give different shapes."
 _TIED = 1.0 - 1e-6
 """Entries this close to a mode's largest tie with it, as left and right do in symmetric shapes."""
 

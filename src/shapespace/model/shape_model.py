@@ -374,7 +374,7 @@ class ShapeModel:
             name = shape.name if isinstance(shape, Mesh) else "The shape"
             raise CorrespondenceError(
                 f"{name} has {len(vertices)} vertices but the model has {self.n_vertices}; only shapes in the "
-                "model's vertex order can be projected; fit this one instead (shapespace fit, or fit_scan)."
+                "model's vertex order can be projected; fit this mesh instead (shapespace fit, or fit_scan)."
             )
         is_observed: BoolArray = ~np.logical_or.reduce(np.isnan(vertices), axis=1)
         if np.isinf(vertices).any() or is_observed.sum() < _FEWEST_OBSERVED:

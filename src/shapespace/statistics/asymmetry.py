@@ -415,7 +415,8 @@ def _in_reference(
     if ((share > 0) & (share < 1)).any():
         mixed = names[int(np.flatnonzero((share > 0) & (share < 1))[0])]
         raise InputError(
-            f"{cohort.table.where}: some shapes of {mixed} have {column} {value} and others not; give each subject one."
+            f"{cohort.table.where}: some shapes of {mixed} have {column} {value} and others not; give each "
+            "subject one value."
         )
     if share.sum() < _FEWEST:
         raise InputError(

@@ -139,7 +139,7 @@ def find_sides(cohort: Cohort) -> Sides:
     if rival <= SYMMETRIC_SHARE:
         notes.append(
             f"The mean has another plane of symmetry, {100 * rival:.2f} % of its size off compared with "
-            f"{100 * symmetry.off_share:.2f} %; if that is the one you mean, name the pairs with --pairs."
+            f"{100 * symmetry.off_share:.2f} %; if you mean that plane, name the pairs with --pairs."
         )
     everything = np.arange(cohort.n_vertices, dtype=np.int32)
     other = mirror_pairs(mesh, symmetry)
@@ -182,7 +182,7 @@ def given_sides(cohort: Cohort, pairs: Sequence[tuple[int, int]], where: str = "
                 )
         if other.get(a, b) != b or other.get(b, a) != a:
             twice = (a if other.get(a, b) != b else b) + first
-            raise InputError(f"{where}: the {noun} {twice} is in two pairs; keep one.")
+            raise InputError(f"{where}: the {noun} {twice} is in two pairs; keep one of the pairs.")
         other[a], other[b] = b, a
     notes: tuple[str, ...] = ()
     single = [v for v in range(cohort.n_vertices) if v not in other]

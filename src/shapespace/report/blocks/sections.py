@@ -749,7 +749,7 @@ def _unit(config: Mapping[str, Any]) -> str:
 
 def _scale(config: Mapping[str, Any]) -> str:
     effect = str(config.get("scale_in_effect", config.get("scale")))
-    text = {"free": "free: each fit finds its own", "fixed": "fixed: scans and model are of one size"}.get(
+    text = {"free": "free: each fit finds its own", "fixed": "fixed: scans and model have the same size"}.get(
         effect, plain(effect)
     )
     return f"{text}, as the model is made" if config.get("scale") == "auto" else text

@@ -293,7 +293,7 @@ def quality_figure(quality: Quality | Mapping[str, object], *, title: str = "") 
     """
     if not isinstance(quality, Quality):
         try:
-            quality = read(Quality, quality, "What was measured of a model", "give lists of numbers")
+            quality = read(Quality, quality, "The quality of a model", "give lists of numbers")
         except FileFormatError as error:
             raise InputError(str(error)) from error
     qualities = [quality, *quality.others]

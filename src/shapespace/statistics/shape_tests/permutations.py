@@ -140,6 +140,6 @@ class Groups:
             raise InputError(
                 f"{cohort.table.where}: the group {names[small]!r} of {label} has {groups.counts[small]} "
                 f"shape{'s' if groups.counts[small] > 1 else ''}, and "
-                f"{why or 'this test'} needs {least} or more; leave it out, or combine groups."
+                f"{why or 'this test'} needs {least} or more; exclude the group, or combine groups."
             )
         return groups
