@@ -147,7 +147,7 @@ def _duplicates(raw: LandmarkConfigurations) -> list[str]:
 
 
 def find_other_scales(raw: LandmarkConfigurations) -> list[str]:
-    """Return a sentence on each specimen whose size differs so much that its unit or scale is another one."""
+    """Return a sentence on each specimen whose size differs so much that it has another unit or scale."""
     # Root mean squares, which missing landmarks hardly change.
     known = [points[seen] for points, seen in zip(raw.points, raw.observed, strict=True)]
     sizes = np.array(

@@ -316,7 +316,7 @@ def _comparison_sentences(targets: Sequence[_QualityInput], differences: dict[st
 def _draw(result: Quality, output: Path, notes: list[str]) -> None:
     """Write the curves as PNG and SVG, if the extra `report` is installed."""
     if importlib.util.find_spec("matplotlib") is None or importlib.util.find_spec("PIL") is None:
-        notes.append('The curves are not drawn; pip install "shapespace[report]" adds what draws them.')
+        notes.append('The curves are not drawn; install the drawing packages with pip install "shapespace[report]".')
         return
     from shapespace.report import figures
 

@@ -213,7 +213,7 @@ def recognise_transfer(model: Path, person: Path, expression: Path, output: Path
     Raises:
         FileError: something cannot be read, or the mesh not written.
         FileFormatError: a record is damaged.
-        InputError: the model does not separate identity and expression, or a fit is of another one.
+        InputError: the model does not separate identity and expression, or a fit is of another model.
     """
     from shapespace.model.additive import AdditiveModel
 

@@ -575,7 +575,7 @@ def _outlier_reason(registration: ScanRegistration, distance: float) -> str:
 
 
 def _resolve_alternatives(problem: _RunConstants, state: RegistrationState) -> RegistrationState:
-    """If several poses are about equally likely, use the one whose shape the scans of certain pose predict best."""
+    """If several poses are about equally likely, use the pose whose shape the scans of certain pose predict best."""
     sure = [i for i, registration in state.registrations.items() if not registration.alternatives]
     if not _ENOUGH_TO_PREDICT <= len(sure) < len(state.registrations):
         return state
@@ -627,7 +627,7 @@ def _find_evidence(state: RegistrationState) -> dict[int, SurfaceEvidence]:
 
 
 def _consensus_deg(state: RegistrationState, i: int) -> float:
-    """Return the rotation between the pose of a scan and the one on which the comparisons agree (C32); 0 if unknown."""
+    """Return the rotation between a scan's pose and the pose on which the comparisons agree (C32); 0 if unknown."""
     T = None if state.bends else state.consensus.get(i)
     return 0.0 if T is None else angle_deg(T, state.registrations[i].T_scan_template)
 

@@ -135,7 +135,7 @@ def bent_shapes(template: IntrinsicShape, scan: IntrinsicShape, seed: int) -> li
 
 
 def distinct(shapes: Iterable[FloatArray], size_mm: float, known: Sequence[FloatArray] = ()) -> list[FloatArray]:
-    """Return those of `shapes` (V, 3) that are apart from the ones before, and from known ones."""
+    """Return those of `shapes` (V, 3) that differ from the shapes before them, and from the known shapes."""
     found: list[FloatArray] = []
     for shape in shapes:
         if all(is_apart(shape, other, size_mm) for other in (*known, *found)):

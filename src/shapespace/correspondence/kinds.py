@@ -185,9 +185,10 @@ class Collection:
         return rms / max(float(np.median(rms[core])), _LEAST_DISTANCE * rms_size(self.template))
 
     def separate_core(self, candidates: _Indices) -> _Indices:
-        """Return the core of `candidates` (M,) that is most separate from the rest, of some grown from similar ones.
+        """Return the core of `candidates` (M,) that is most separate from the rest; empty if there is none.
 
-        It is empty if there is none. A core of two kinds also predicts both, so the largest one can be mixed.
+        Several cores are grown, each from a few similar shapes. A core of two kinds also
+        predicts both, so the largest core can be mixed.
         """
         aligned, _ = align_to_weighted_mean(self.shapes[candidates], self.observed[candidates], self.template)
         flat = aligned.reshape(len(candidates), -1)

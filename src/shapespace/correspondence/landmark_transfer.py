@@ -247,8 +247,8 @@ class MarkedSpecimens:
     def suggest(self, count: int = 5) -> list[tuple[str, float]]:
         """Return the specimens to mark next, best first, each given those before it.
 
-        The best specimen is the one that lowers the mean shape distance of all specimens to the nearest marked one
-        most, since errors grow with this distance; without marked specimens it is the medoid.
+        Errors grow with the shape distance to the nearest marked specimen. The best specimen lowers the mean of this
+        distance over all specimens most; without marked specimens it is the medoid.
 
         Returns:
             (name, mean distance to the nearest marked specimen once it is marked, as a share of the size).

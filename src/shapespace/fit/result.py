@@ -255,7 +255,7 @@ class FitResult:
             stage: a name of `stages`.
 
         Raises:
-            InputError: another model than the one that was fitted.
+            InputError: another model than the model that was fitted.
         """
         if model is not None and model is not self.model and model.content_hash != self.model_hash:
             raise InputError(

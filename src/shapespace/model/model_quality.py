@@ -299,7 +299,7 @@ class QualityTask:
 
     Args:
         held: indices of the held-out shapes.
-        order: indices of all other shapes, in random order; models of fewer shapes are built from the first ones.
+        order: indices of all other shapes, in random order; models of fewer shapes are built from the first shapes.
         drawn: indices of the random shapes.
     """
 

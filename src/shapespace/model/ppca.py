@@ -199,7 +199,7 @@ def _maximise(
 ) -> tuple[FloatArray, FloatArray, float, float]:
     """Return W (V, 3, K + 1) and its covariance by pattern (C23), the explained squares, and its part of the bound.
 
-    A vertex has its own normal equations, over the shapes that observe it; they differ by the pattern of missing ones.
+    Each vertex has normal equations over the shapes that observe it; the equations differ by pattern.
 
     Args:
         centred: (N, V, 3) centred shapes, zero at missing vertices.

@@ -354,7 +354,7 @@ def distances_text(fit: SavedFit) -> str:
     overlap = fit.record.shown
     seen, covered = (overlap.model_seen_share, overlap.scan_covered_share) if overlap else (None, None)
     return (
-        f"On average, over what the scan shows: model to scan {to_scan}{_over(seen, 'model')}, scan to model "
+        f"On average, over the parts that the scan shows: model to scan {to_scan}{_over(seen, 'model')}, scan to model "
         f"{to_model}{_over(covered, 'scan')}."
     )
 

@@ -391,7 +391,7 @@ class FolderPage:
                             f"+{limit:g} mm, scan outside",
                         )
                     ],
-                    "Grey is what the scan does not show. Distances to a scan of points only have no sign: their map "
+                    "Grey parts are not shown by the scan. Distances to a scan of points only have no sign: their map "
                     f"runs from 0 to {limit:g} mm.",
                 )
             )

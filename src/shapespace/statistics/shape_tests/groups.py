@@ -353,7 +353,7 @@ class _MeanDistance:
         """Return the (B,) squared distances less that of a limit by their standard error, the observed value first.
 
         In the bootstrap samples the means differ by the limit, which is `relative` to the estimated variance or not. An
-        observed distance below the distance by sampling alone counts as the latter, since no sample shows smaller ones.
+        observed distance below the distance by sampling alone is replaced by it, since samples show no smaller distance.
         """
         # M25
         scale = limit / self.length
