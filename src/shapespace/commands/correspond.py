@@ -305,7 +305,7 @@ class RoundsWithProgress:
 
 @dataclass(frozen=True)
 class ScansRead:
-    """Content, notes and hashes of the scans that were read, and the reasons of the others, by name."""
+    """Content, notes and hashes of the usable scans by name, and why the other scans cannot be used."""
 
     scans: dict[str, Mesh] = field(default_factory=dict[str, Mesh])
     notes: dict[str, list[str]] = field(default_factory=dict[str, list[str]])

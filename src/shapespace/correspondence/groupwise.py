@@ -296,7 +296,7 @@ def _decide_sides(problem: _RunConstants, run: Runner, *, may_reflect: bool) -> 
         if problem.config.pose != "search":  # the frame of a reflected template is not that of any file
             raise InputError(
                 f"--pose {problem.config.pose} cannot be used: the first template is a mirror image of most scans. "
-                "Give one of those as --template, or omit --pose."
+                "Give one of these scans as --template, or omit --pose."
             )
         first = replace(problem.first, mesh=mirror_image(problem.first.mesh))
         usable = np.isin(np.arange(count), list(problem.first.repaired))

@@ -280,7 +280,7 @@ class FaceGenerator:
             name: name of the mesh; None for one made from person and expression.
 
         Raises:
-            InputError: weights, or a warp, of the wrong number.
+            InputError: another number of weights, or of vertices of a warp, than the generator has.
         """
         if person.warp_mm is not None and person.warp_mm.shape != self._coarse.shape:
             raise InputError("The warp of this person has another number of vertices than the generator.")

@@ -58,8 +58,8 @@ class AnovaRow:
         ss: sum of squares, mm^2.
         df: degrees of freedom: those of the subjects times the dimensions of the shapes (Klingenberg 2002).
         ms: mean square, ss / df.
-        f: ms divided by that of `individual x side`, or for that row by that of the asymmetric error; None without a
-            divisor.
+        f: ms divided by the ms of `individual x side`; for the row `individual x side`, divided by the ms of the
+            asymmetric error; None without a divisor.
         p: p value by permutation; None if nothing can be permuted.
         z: F in standard deviations of its permutation distribution, after a Box-Cox transformation; None without p.
         r2: share of the total sum of squares.

@@ -191,9 +191,9 @@ class WithinSubjects:
         matrix = between.matrix[self.rows[first]]
         if s - matrix.shape[1] < 1:
             raise InputError(
-                f"In {self.design.formula!r} only {s} of {self.count} blocks have shapes in the conditions that "
-                f"{label} needs, too few for {matrix.shape[1]} columns between them; remove it, or exclude "
-                "classes with few shapes."
+                f"In {self.design.formula!r} only {s} of {self.count} {self.blocks}s have shapes in the conditions "
+                f"that {label} needs, too few for {matrix.shape[1]} columns between {self.blocks}s; remove this "
+                "effect, or exclude classes with few shapes."
             )
         columns = np.arange(matrix.shape[1], dtype=np.intp)
         check_not_aliased(matrix, columns, terms, self.design, where)

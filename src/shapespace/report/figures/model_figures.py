@@ -93,7 +93,7 @@ def modes_figure(model: ShapeModel, modes: int = 5, deviations: float = 3.0, *, 
         model: the shape space.
         modes: largest number of modes.
         deviations: standard deviations to each side.
-        title: above the figure.
+        title: text above the figure.
 
     Raises:
         InputError: fewer than one mode, or deviations that are not positive.

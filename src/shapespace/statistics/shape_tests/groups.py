@@ -353,7 +353,7 @@ class _MeanDistance:
         """Return the (B,) squared distances less that of a limit by their standard error, the observed value first.
 
         In the bootstrap samples the means differ by the limit, which is `relative` to the estimated variance or not. An
-        observed distance below the distance by sampling alone is replaced by it, since samples show no smaller distance.
+        observed distance below the distance by sampling alone is replaced by it, since no sample shows a smaller one.
         """
         # M25
         scale = limit / self.length
