@@ -210,7 +210,7 @@ def match_rows(
     where: Path | str,
     remedy: str = "give the folder of its specimens with --shapes",
 ) -> tuple[dict[int, int], list[str]]:
-    """Return the number of the specimen of each row that has one, by name, and sentences on rows and specimens without.
+    """Match rows to specimens by name: return row -> number of its specimen, and sentences on all without a match.
 
     A row names its specimen, or its file with or without ending and folders, which may be joined by `_` as in the names
     of fits. Case, white space at the ends and the Unicode form of letters are significant only if specimens differ in

@@ -47,9 +47,9 @@ def convert_landmarks(
         to: format: tps, nts, morphoj, csv (a row for each specimen), long (a row for each landmark), or a folder of
             mrk.json or fcsv (default: by the ending of OUT)
         sliders: CSV of the semilandmarks as geomorph has them: before, slide, after, or surface; can be repeated
-        object_name: array of an R file with several, such as plethodon$land
+        object_name: name of the array in an R file with several arrays, such as plethodon$land
         curve_points: points of each curve or outline, at equal distances (default: see `align`)
-        dimensions: 2 or 3, of raw coordinates of MorphoJ whose number fits both (default: by their number)
+        dimensions: 2 or 3, for raw MorphoJ coordinates if their number is divisible by both (default: by their number)
 
     Raises:
         FileError: something cannot be read or written.

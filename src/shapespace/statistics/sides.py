@@ -212,8 +212,9 @@ def given_sides(cohort: Cohort, pairs: Sequence[tuple[int, int]], where: str = "
     share = off / rms_size(x)
     if share > LARGEST_PAIRED_OFF:
         raise InputError(
-            f"{where}: the mean lies {100 * share:.0f} % of its size from its mirror image by them, and "
-            f"{100 * LARGEST_PAIRED_OFF:.0f} % is the most; check that each row names points that mirror each other."
+            f"{where}: the mean lies {100 * share:.0f} % of its size from its mirror image by these "
+            f"pairs, and at most {100 * LARGEST_PAIRED_OFF:.0f} % is allowed; check that each row names points that "
+            "mirror each other."
         )
     left = cohort.n_vertices - len(vertices)
     notes += (f"{left} of {cohort.n_vertices} vertices are in no pair of {where} and are excluded.",) if left else ()
