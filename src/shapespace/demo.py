@@ -445,7 +445,7 @@ def _paper_table(folder: Path, first: ExpressionsOfOne, second: ManyPeople) -> l
 
 
 def _claim(folder: Path, case: Case) -> Claim:
-    """Return the result of the paper for its real scan with that of a case of experiment 2."""
+    """Return the distance that the paper reports for its real scan, with the distances of one case of experiment 2."""
     fit, truth = case.fit, None
     measured = f"failed: {fit.reason}"
     if fit.stages:

@@ -614,7 +614,7 @@ class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
 
 
 class Measured(Struct, frozen=True, kw_only=True):
-    """A measure by the number of modes; without `modes`, for 1, 2, 3 and so on."""
+    """A measure for each number of modes; without `modes`, these numbers are 1, 2, 3 and so on."""
 
     mean: tuple[float, ...]
     modes: tuple[float, ...] | None = None

@@ -316,7 +316,7 @@ class SurfaceLandmarks(Mapping[str, int]):
         corners, weights = np.array(self.corners, dtype=np.int64), np.array(self.barycentric, dtype=np.float64)
         distance = np.array(self.distance_mm, dtype=np.float64) if len(self.distance_mm) else np.zeros(count)
         if len(set(names)) < count:
-            raise InputError("Two landmarks have the same name; rename one.")
+            raise InputError("Two landmarks have the same name; rename one of the landmarks.")
         if corners.shape != (count, 3) or weights.shape != (count, 3) or distance.shape != (count,):
             raise InputError(
                 f"{count} landmarks need corners ({count}, 3), barycentric coordinates ({count}, 3) and distances "

@@ -131,7 +131,7 @@ def test_data_faces_writes_wide_people_and_faces_alone_and_says_so(run: Run, tmp
     assert len(read_mesh(folder / "subject_000_neutral.ply").vertices) < 10_000
     refused = run("data", "faces", "-o", tmp_path / "ict", "--source", "ict-facekit", "--wide")
     assert refused.code == 2
-    assert "leave --wide out" in refused.err
+    assert "omit --wide" in refused.err
     assert not (tmp_path / "ict").exists()
 
 
@@ -265,7 +265,7 @@ def test_build_omits_training_shapes_on_request_and_states_what_is_lost(
 def test_convert_never_writes_training_shapes(run: Run, world: World, tmp_path: Path, output: str) -> None:
     run("build", world.meshes, "-o", tmp_path / "m.h5", "--modes", "3")
     converted = run("convert", tmp_path / "m.h5", tmp_path / output)
-    assert f"Left out: 12 training shapes, so {NOT_CALIBRATED}" in converted.out
+    assert f"Omitted: 12 training shapes, so {NOT_CALIBRATED}" in converted.out
     assert ShapeModel.load(tmp_path / output).training is None
     assert ShapeModel.load(tmp_path / "m.h5").training is not None
     again = run("convert", tmp_path / output, tmp_path / "again.h5")

@@ -76,4 +76,4 @@ def test_effects_that_cannot_be_are_refused(run: Run, tmp_path: Path) -> None:
     told = run("data", "faces", "-o", tmp_path / "a", "--effect", "99")
     assert "between -20.0 and 20.0 mm" in told.sentence()
     told = run("data", "faces", "-o", tmp_path / "b", "--effect", "2", "--source", "ict-facekit")
-    assert "leave --effect out" in told.sentence()
+    assert "omit --effect" in told.sentence()

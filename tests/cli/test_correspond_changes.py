@@ -166,7 +166,7 @@ def test_odd_scans_are_added_or_excluded_as_in_a_run_and_none_by_the_others(
     assert np.linalg.norm(surface(same, "cloud") - surface(same, "blob5"), axis=1).mean() < 2.0
     assert not any("times the usual distance" in str(note) for note in (record(same, "cloud")["notes"], outcome.err))
     notes = [str(record(same, name)["notes"]) for name in ("blob5", "copy")]
-    assert any("again; leave one of them out" in note for note in notes)
+    assert any("again; exclude one of the two" in note for note in notes)
     assert add(run, alone, odd / "blob5.ply").code == 0
     np.testing.assert_array_equal(surface(alone, "blob5"), surface(same, "blob5"))
 
@@ -251,14 +251,14 @@ def test_refusals_are_one_sentence_and_change_nothing(run: Run, same: Path, tmp_
         (("--redo", "nobody", "-o", same), "--redo nobody: "),
         (("--remove", "nobody", "-o", same), "has no scan of that name; it has blob0, blob1, blob2, blob3, blob4."),
         ((*all_but_one, "-o", same), "--remove leaves 1 of the scans"),
-        ((added, "--remove", "blob0", "-o", same), "leave the files out"),
+        ((added, "--remove", "blob0", "-o", same), "omit the files"),
         (("--add", "-o", same), "--add needs scans"),
         (("-o", same), "Give scans"),
         ((added, "--add", "--vertices", "400", "-o", same), "was computed with --vertices 300"),
         ((added, "--add", "--outer", "-o", same), "was computed without --outer"),
-        ((added, "--add", "--rounds", "1", "-o", same), "leave --rounds out"),
-        ((added, "--add", "--template", added / "blob5.ply", "-o", same), "leave --template out"),
-        ((added, "--add", "--model", "m.h5", "-o", same), "leave --model out"),
+        ((added, "--add", "--rounds", "1", "-o", same), "omit --rounds"),
+        ((added, "--add", "--template", added / "blob5.ply", "-o", same), "omit --template"),
+        ((added, "--add", "--model", "m.h5", "-o", same), "omit --model"),
     ):
         outcome = run("correspond", *line, *QUIET)
         assert outcome.code == 2 and said in outcome.sentence(), outcome.err

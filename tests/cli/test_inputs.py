@@ -55,7 +55,7 @@ def test_lists_of_lines_and_patterns_name_scans(run: Run, world: World, tmp_path
     ("text", "said"),
     [
         ("person,age\na,3\n", "needs a column named scan or file or path"),
-        ("scan,scan\na,b\n", "two columns of one name"),
+        ("scan,scan\na,b\n", "two columns of the same name"),
         ("scan\n", "lists no scans"),
         ("", "needs a column"),
         ("id,scan\n../x,a.ply\n", "row 2 has an id that no file can have"),

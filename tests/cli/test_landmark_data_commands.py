@@ -89,7 +89,7 @@ def test_a_check_names_what_is_missing_duplicate_mirrored_swapped_and_in_another
     facts = outcome.facts
     assert facts["missing_by_specimen"] == {"n1": 2, "n2": 1} and facts["missing_by_landmark"] == {"3": 1, "5": 2}
     for words in (
-        "n9 has the same coordinates as n8", "Landmarks 7 and 9 are at one place in 1 of 24 specimens",
+        "n9 has the same coordinates as n8", "Landmarks 7 and 9 are at the same place in 1 of 24 specimens",
         "n7 is 10", "n3 is mirrored", "n5: exchange of the landmarks 1 and 2",
     ):  # fmt: skip
         assert sum(words in finding for finding in facts["findings"]) == 1, words
@@ -184,7 +184,7 @@ def test_bad_input_ends_with_one_sentence(run: Run, table: Path, tmp_path: Path)
     none = tmp_path / "none.tps"
     for arguments, words in (
         (("landmarks", "check", none), "no such file"),
-        (("landmarks", "check", table, "-o", none), "-o goes with SAME"),
+        (("landmarks", "check", table, "-o", none), "-o goes with SAME, the folder that correspond wrote; omit -o"),
         (("landmarks", "convert", table, "-o", table), "is the file to convert"),
         (("landmarks", "convert", table, "-o", tmp_path / "a.doc"), "has no format"),
         (("landmarks", "convert", table, "-o", tmp_path / "a.csv", "--to", "word"), "there is no format 'word'"),

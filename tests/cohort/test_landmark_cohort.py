@@ -142,7 +142,7 @@ def test_landmarks_are_compared_by_their_names_in_any_order(tmp_path: Path) -> N
     np.testing.assert_allclose(again.coefficients, expected.coefficients, atol=1e-12)
     with pytest.raises(InputError, match=r"not those of the shapes to compare with \(a, z\)"):
         read_cohort(tmp_path / "z.csv", onto=cohort)
-    with pytest.raises(InputError, match="Shapes of 7 landmarks cannot be compared with those of 8"):
+    with pytest.raises(InputError, match="Shapes of 7 landmarks cannot be compared with shapes of 8 landmarks"):
         Cohort.of_shapes(np.zeros((1, 7, 3)), {}, onto=cohort)
 
 

@@ -161,7 +161,7 @@ def test_rows_can_be_taken_in_any_order() -> None:
         ("file,age\n", "no table of specimens"),
         ("", "no table of specimens"),
         ("file,age\na,1\n,2\n", "has no file in row 2"),
-        ("file,age,age\na,1,2\n", r"two columns of one name \('age'\)"),
+        ("file,age,age\na,1,2\n", r"two columns of the same name \('age'\)"),
         ("file,age\na,1,2\n", "3 cells in row 1"),
         ('file,age\n"a,1\n', "not a CSV table"),
     ],

@@ -213,7 +213,7 @@ def test_what_is_odd_about_a_scan_is_said_and_kept(say: Callable[..., str], tmp_
     )
     said = say(a=SCANS[0], b=SCANS[1], c=crumbed, again=SCANS[0], fins=finned(SCANS[3]))
     assert "c: It has 2 separate pieces" in said and "fins: 60 edges have more than two triangles" in said
-    assert "again: It is a again; leave one of them out." in said or "a: It is again again" in said
+    assert "again: It is a again; exclude one of the two." in said or "a: It is again again" in said
     assert '"notes": [\n  "It has 2 separate pieces' in (tmp_path / "same" / "c.correspond.json").read_text("utf-8")
 
 

@@ -29,7 +29,7 @@ def test_notes_on_scans_are_those_of_the_command(
     assert main(["correspond", str(tmp_path / "scans"), "-o", str(tmp_path / "same"), *options]) == 0
     said = capsys.readouterr().err
     for sentence in (
-        "copy: It is blob0 again; leave one of them out.",
+        "copy: It is blob0 again; exclude one of the two.",
         "1 of 4 scans is in another unit than the majority, judging by size (metres); so are the surfaces, and build "
         "converts them to the unit of the majority.",
     ):

@@ -76,7 +76,7 @@ def test_what_does_not_belong_to_the_model_is_refused():
     model = blob_model(300)
     space = ss.ShapeSpace(model=model).fit([])
     scan = raw_scan(np.zeros(5), similarity(2, 8.0, 1.0)).scan
-    with pytest.raises(CorrespondenceError, match="fit this one instead"):
+    with pytest.raises(CorrespondenceError, match="fit this mesh instead"):
         space.transform([scan])
     other = failed_record(File(name="t.ply", hash="b"), File(name="m.h5", hash="f" * 64), "t.ply is empty.", {})
     with pytest.raises(InputError, match=r"t\.ply was fitted with the model ffffffffffff"):

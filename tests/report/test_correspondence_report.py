@@ -91,7 +91,7 @@ def test_the_first_sentences_say_whether_to_go_on(page: str) -> None:
     words = Page(page).words
     assert "6 of 7 scans are in correspondence; 3 of them need review; 1 is excluded." in words
     assert "1 scan has folded triangles" in words
-    assert "The rounds have not settled: in the last one vertices still moved by 1.2 % of the size" in words
+    assert "The rounds have not settled: in the last round vertices still moved by 1.2 % of the size" in words
 
 
 def test_what_stands_out_has_its_reason_and_comes_first(page: str, template: Path) -> None:

@@ -94,7 +94,7 @@ def test_distances_over_what_the_scan_shows_stand_first(fits: Path, sketched: No
             record["shown"] = {**both, "model_seen_share": 0.625, "scan_covered_share": 0.875}
             path.write_text(json.dumps(record))
     new = Page(write_report(fits).read_text(encoding="utf-8")).words
-    assert "over what the scan shows: model to scan 0.12 mm (62 % of the model)" in new
+    assert "over the parts that the scan shows: model to scan 0.12 mm (62 % of the model)" in new
     assert "scan to model 0.38 mm (88 % of the scan)" in new and "Scan to model 0.38 mm on average" in new
     assert "Model to scan where shown, mean" in new and "Model shown, %" in new and "Whole model" not in new
     assert "where the scan shows the surface, median of the converged fits" in new and "whole model" not in new

@@ -555,7 +555,7 @@ def test_coefficients_that_do_not_go_together_are_refused() -> None:
     one, other = (figures.Coefficients("a", "", 0, np.ones(k), np.ones(k)) for k in (2, 3))
     with pytest.raises(InputError, match="different models"):
         figures.scatter_matrix([one, other])
-    with pytest.raises(InputError, match="without scans"):
+    with pytest.raises(InputError, match="no scans, so there are no coefficients"):
         figures.b_space([])
     with pytest.raises(InputError, match="two coefficients"):
         figures.b_plane(scans(np.ones((3, 1)), "a", np.ones(1)))

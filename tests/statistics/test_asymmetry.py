@@ -366,7 +366,7 @@ def test_an_object_without_mirror_symmetry_is_refused() -> None:
         ([(0, 10_000)], "there is no vertex 10000"),
         ([(0, 1), (0, 2), (3, 4)], "is in two pairs"),
         ([(0, 1)], "name 2 vertices"),
-        ([(k, (k * 7 + 3) % 5 + 60) for k in range(5)], "of its size from its mirror image by them"),
+        ([(k, (k * 7 + 3) % 5 + 60) for k in range(5)], "of its size from its mirror image by these pairs"),
     ],
 )
 def test_pairs_that_cannot_be_are_refused(thing: Symmetric, pairs: list[tuple[int, int]], said: str) -> None:

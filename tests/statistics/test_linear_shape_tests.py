@@ -301,8 +301,9 @@ def test_designs_that_cannot_be_tested_are_refused() -> None:
     cohort = simulate(rng.normal(size=(12, 15)), table)
     for words, call in (
         ("no shape with p", lambda: compare_trajectories(cohort, group=("g",), points="p")),
-        ("two or more different points", lambda: compare_trajectories(cohort, group=("g",), points="one")),
-        ("two or more different points",
+        ("two or more points: each class of 'one' exactly once, not k",
+         lambda: compare_trajectories(cohort, group=("g",), points="one")),
+        ("two or more points: each class of 't' exactly once, not t1, t2",
          lambda: compare_trajectories(cohort, group=("g",), points="t", order=("t1", "t2"), formula="~ g * t")),
         ("two different values", lambda: compare_pairs(cohort, formula="~ g", group=("one",))),
         ("nested", lambda: compare_pairs(cohort, formula="~ g", group=("g",), null="~ t")),

@@ -238,7 +238,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class BatchConfig:
-    """What the fits of a batch have in common.
+    """Settings that all fits of a batch share.
 
     Args:
         model: shape model of the fits.

@@ -73,7 +73,7 @@ class CommandParser(argparse.ArgumentParser):
         return parsed, unknown
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
-        """Name the command that is nearest to an unknown one."""
+        """Reject an unknown command, and suggest the command with the nearest name."""
         names: list[str] = list(action.choices or ()) if action.metavar and not action.option_strings else []
         if self._command is None and names and value not in names:
             raise argparse.ArgumentError(

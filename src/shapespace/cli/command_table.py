@@ -80,7 +80,7 @@ class CommandSpec:
         examples: command lines.
         run: module and name of the function that runs it, see `cli.dispatch.run_command`.
         arguments: arguments in the order of the help.
-        details: paragraphs on what it reads and writes, for `--help-all` and the reference.
+        details: paragraphs on the files that it reads and writes, for `--help-all` and the reference.
         json: whether it prints facts, with `--json`.
         defaults: further attributes of the parsed arguments.
         settings: values that are rarely changed, given as `--set NAME=VALUE`.

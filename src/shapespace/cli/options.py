@@ -140,7 +140,7 @@ class Option:
 
     @property
     def accepted(self) -> tuple[str, ...]:
-        """The values that it accepts; empty for all that can be parsed."""
+        """Choices of the option; empty if it accepts all values that can be parsed."""
         return self.choices or (self._field.choices if self._field and not self.parse and not self.metavar else ())
 
     @property

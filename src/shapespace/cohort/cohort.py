@@ -182,7 +182,10 @@ class Cohort:
             self.analysed is None or self.analysed.shape == (len(self.reference),)
         )
         if not agree:
-            raise InputError("The masks of a cohort need a flag for each vertex, and that of observed ones a row each.")
+            raise InputError(
+                "The masks of a cohort need a flag for each vertex, and the mask of observed vertices needs a row for "
+                "each shape."
+            )
         agree = (
             self.coefficients.shape == (n, len(self.basis))
             and self.basis.shape[1] == self.reference.size
@@ -421,7 +424,7 @@ class Cohort:
             if shapes.shape[1] != onto.n_vertices:
                 noun = "landmarks" if onto.source.kind == "landmarks" else "vertices"
                 raise InputError(
-                    f"Shapes of {shapes.shape[1]} {noun} cannot be compared with those of {onto.n_vertices}."
+                    f"Shapes of {shapes.shape[1]} {noun} cannot be compared with shapes of {onto.n_vertices} {noun}."
                 )
             if analysed is not None:
                 mask = None if is_observed[:, analysed].all() else np.logical_and(is_observed, analysed)
@@ -662,7 +665,7 @@ def check_distinct(cohort: Cohort) -> None:
     if len(pairs):
         least = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))[0]]
         first, second = cohort.names[int(least[0])], cohort.names[int(least[1])]
-        raise InputError(f"{first} and {second} are the same shape up to rounding; exclude one.")
+        raise InputError(f"{first} and {second} are the same shape up to rounding; exclude one of the two.")
 
 
 def with_columns(cohort: Cohort, columns: Mapping[str, FloatArray]) -> Cohort:

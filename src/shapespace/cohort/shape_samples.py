@@ -21,7 +21,7 @@ _FARTHEST = 0.5
 
 
 class ShapeSamples(Protocol):
-    """S samples (V, 3) of one shape by their number, such as an array (S, V, 3)."""
+    """S samples (V, 3) of one shape, indexed by their number; for example an array (S, V, 3)."""
 
     def __len__(self) -> int: ...
 

@@ -58,7 +58,9 @@ class Table:
                 )
         plain = {name.strip(): tuple(map(str.strip, cells)) for name, cells in self.columns.items()}
         if len(plain) < len(self.columns):
-            raise InputError(f"{self.where} has two columns whose names differ only in white space; rename one.")
+            raise InputError(
+                f"{self.where} has two columns whose names differ only in white space; rename one of the columns."
+            )
         object.__setattr__(self, "columns", plain)
 
     @staticmethod
@@ -73,16 +75,19 @@ class Table:
             where: name of the table in messages.
 
         Raises:
-            InputError: the data are no table, have no rows or two columns of one name, or name no specimens.
+            InputError: the data are no table, have no rows or two columns of the same name, or name no specimens.
         """
         own: list[Any] = list(
             data.columns if hasattr(data, "columns") else data.keys() if hasattr(data, "keys") else ()
         )
         heads = [str(head).strip() for head in own]
         if not heads:
-            raise InputError(f"{where} is no DataFrame or mapping with columns, but {type(data).__name__}; give one.")
+            raise InputError(
+                f"{where} is no DataFrame or mapping with columns, but {type(data).__name__}; give a DataFrame or a "
+                "mapping."
+            )
         if len(set(heads)) < len(heads):
-            raise InputError(f"{where} has two columns of one name; rename one.")
+            raise InputError(f"{where} has two columns of the same name; rename one of the columns.")
         columns = {head: tuple(cell_text(value) for value in data[name]) for head, name in zip(heads, own, strict=True)}
         key = key_column(heads)
         index: Any = getattr(data, "index", None)
@@ -205,7 +210,7 @@ def match_rows(
     where: Path | str,
     remedy: str = "give the folder of its specimens with --shapes",
 ) -> tuple[dict[int, int], list[str]]:
-    """Return the number of the specimen of each row that has one, by name, and sentences on rows and specimens without.
+    """Match rows to specimens by name: return row -> number of its specimen, and sentences on all without a match.
 
     A row names its specimen, or its file with or without ending and folders, which may be joined by `_` as in the names
     of fits. Case, white space at the ends and the Unicode form of letters are significant only if specimens differ in

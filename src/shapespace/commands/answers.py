@@ -83,7 +83,7 @@ def write_report(folder: Path, output: Path | None, *, model: Path | None, label
 
 @contextmanager
 def drawing(*, quiet: bool) -> Generator[Callable[[str, int], None]]:
-    """Return a context with the progress of pictures, whose function is called after each."""
+    """Return a context with a progress bar; its function is called after each picture, with (name, number planned)."""
     with progress(None, "drawing", "picture", quiet=quiet) as bar:
 
         def step(name: str, planned: int) -> None:

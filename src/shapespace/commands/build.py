@@ -60,7 +60,8 @@ class BuildFilesConfig:
         landmarks: landmarks of the model: points on the first mesh in any landmark format, a CSV of name,vertex, or
             `landmarks.csv` of correspond (default: landmarks.csv next to the first mesh, otherwise those of the model
             of fitted surfaces).
-        regions: name -> file with its vertices of the meshes, kept in the model for fits that are restricted to one.
+        regions: name -> file with the vertices of this region of the meshes. The model stores the regions, and fits can
+            be restricted to a region.
         labels: separate identity and expression: CSV of file, subject and label, with a neutral face of each subject;
             the number of modes then counts modes of identity (`auto`: 0.995 of the variance).
         expression_variance: share of the expression variance that the expression modes explain, for a model of identity
@@ -97,26 +98,23 @@ class BuildFilesConfig:
         if self.labels is not None and self.model.representation != "vertices":
             raise InputError("A model of identity and expression contains vertices; omit --representation.")
         if self.min_seen is not None and (self.labels is not None or self.model.representation != "vertices"):
-            raise InputError("--min-seen is for models of vertices without --additive; leave it out.")
+            raise InputError("--min-seen is for models of vertices without --additive; omit --min-seen.")
         if self.labels is not None and not self.model.align:
-            raise InputError(
-                "A model that separates identity and expression aligns its faces itself; leave --no-align out."
-            )
+            raise InputError("A model that separates identity and expression aligns its faces itself; omit --no-align.")
         if self.streams and (self.labels is not None or self.model.representation != "vertices"):
             raise InputError(
-                "--out-of-core, --keep-shapes and --add are for models of vertices without --additive; leave them out, "
-                "or --representation and --additive."
+                "--out-of-core, --keep-shapes and --add are for models of vertices without --additive; omit these "
+                "options, or omit --representation and --additive."
             )
         if self.streams and self.min_seen is not None:
             raise InputError("Streamed meshes must be complete, so omit --min-seen.")
         if self.add is not None and (self.gauge is not None or not self.model.align or self.landmarks is not None):
             raise InputError(
-                "--add takes gauge, alignment and landmarks from the model; leave --gauge, --no-align and --landmarks "
-                "out."
+                "--add takes gauge, alignment and landmarks from the model; omit --gauge, --no-align and --landmarks."
             )
         if self.regions and (self.keep_shapes or self.add is not None):
             raise InputError(
-                "--region cannot go with --keep-shapes or --add; leave it out, and give fit a file instead."
+                "--region cannot be combined with --keep-shapes or --add; omit --region, and give the file to fit."
             )
 
     @property
@@ -258,7 +256,7 @@ def _load_parent(path: Path, output: Path) -> ShapeModel:
         InputError: no meshes can be added to the model.
     """
     if path.absolute() == output.absolute():
-        raise InputError(f"{output} is the model that meshes are added to; give another name for the new one.")
+        raise InputError(f"{output} is the model that meshes are added to; give another name for the new model.")
     model = ShapeModel.load(path)
     if model.held_out or model.representation != "vertices":
         reason = "separates identity and expression" if model.held_out else "is of B-spline surfaces"
@@ -371,7 +369,7 @@ def _landmarks_of_parent(
     try:
         parent = ShapeModel.load(path)
     except ShapespaceError:
-        notes.append(f"The model has no landmarks, since the one that fitted these meshes is no longer at {path}.")
+        notes.append(f"The model has no landmarks, since the model that fitted these meshes is no longer at {path}.")
         return SurfaceLandmarks()
     if parent.content_hash != models[0].hash or parent.n_vertices != len(first.vertices):
         notes.append(f"The model has no landmarks, since {path} is not the model that fitted these meshes.")

@@ -28,7 +28,7 @@ def convert(
     expressions: Path | None = None,
     quiet: bool = False,
 ) -> Outcome:
-    """Write the model in `source` to `output`, and note what the new format lacks.
+    """Write the model in `source` to `output`, and note the data that the new format cannot store.
 
     Args:
         source: a model in any format that is read.
@@ -58,7 +58,7 @@ def convert(
     regions = sorted((model if isinstance(model, ShapeModel) else model.shape).regions)
     if target is not None and regions:
         notes.append(
-            f"Left out: the region{'' if len(regions) == 1 else 's'} {', '.join(regions)}, which {target.title} has no "
+            f"Omitted: the region{'' if len(regions) == 1 else 's'} {', '.join(regions)}, which {target.title} has no "
             "place for."
         )
     if "research" in linear.licence.lower() or "non-commercial" in linear.licence.lower():
@@ -76,7 +76,7 @@ def _without_training_shapes(
     shape = model if isinstance(model, ShapeModel) else model.shape
     if shape.training is None:
         return model, []
-    note = f"Left out: {len(shape.training)} training shapes, so {NOT_CALIBRATED}."
+    note = f"Omitted: {len(shape.training)} training shapes, so {NOT_CALIBRATED}."
     shape = replace(shape, training=None)
     return shape if isinstance(model, ShapeModel) else replace(model, shape=shape), [note]
 
@@ -93,7 +93,7 @@ def _load_model(
 ) -> tuple[ShapeModel | AdditiveModel, str, list[str]]:
     if not is_foreign(source):
         if mm is not None:
-            raise InputError(f"{source} is in mm, as all models of shapespace; leave --unit out.")
+            raise InputError(f"{source} is in mm, as all models of shapespace; omit --unit.")
         if expressions is not None:
             raise InputError(f"{source} is a model of shapespace; --expressions goes with the models of eos.")
         return load_model(source), OWN[0], []

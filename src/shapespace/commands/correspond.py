@@ -231,7 +231,7 @@ def _subjects_of(jobs: Sequence[FitJob], column: str | None) -> dict[str, str]:
     if missing := [name for name, subject in subjects.items() if not subject]:
         raise InputError(
             f"The column {column} of --subjects has no value for {len(missing)} of {len(jobs)} scans "
-            f"({first_names(missing, _LISTED)}); fill it in, or leave these scans out."
+            f"({first_names(missing, _LISTED)}); fill it in, or exclude these scans."
         )
     return subjects
 
@@ -305,7 +305,7 @@ class RoundsWithProgress:
 
 @dataclass(frozen=True)
 class ScansRead:
-    """Content, notes and hashes of the scans that were read, and the reasons of the others, by name."""
+    """Content, notes and hashes of the usable scans by name, and why the other scans cannot be used."""
 
     scans: dict[str, Mesh] = field(default_factory=dict[str, Mesh])
     notes: dict[str, list[str]] = field(default_factory=dict[str, list[str]])
@@ -403,7 +403,7 @@ class CorrespondenceFolder:
 
     @contextlib.contextmanager
     def writing(self) -> Generator[CorrespondenceFolder]:
-        """Yield the folder, into which no other run writes during the block, and in which no change is incomplete.
+        """Yield the folder, locked against other writing runs, after an interrupted change of it was completed.
 
         Raises:
             FileError: another run writes into the folder, or files cannot be moved.

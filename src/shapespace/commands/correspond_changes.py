@@ -139,15 +139,13 @@ class _FinishedFolder:
             )
         for option, file in (("--template", files.template), ("--model", files.model)):
             if file is not None:
-                raise InputError(f"The template of a finished correspondence is its mean; leave {option} out.")
+                raise InputError(f"The template of a finished correspondence is its mean; omit {option}.")
         usual = CorrespondConfig()
         for name, option in _OPTIONS.items():
             own = getattr(config, name)
             if getattr(asked, name) not in (own, getattr(usual, name)):
                 value = f"without {option}" if own is False else f"with {option} {own}"
-                raise InputError(
-                    f"{self.results.path} was computed {value}, and a change keeps that; leave {option} out."
-                )
+                raise InputError(f"{self.results.path} was computed {value}, and a change keeps that; omit {option}.")
         return config
 
     def check_names(self, names: Sequence[str], option: str) -> None:
@@ -210,7 +208,7 @@ def change_correspondence(
         first = {finished.records[name].hash: name for name in kept if name not in read.scans}
         for name, content_hash in read.hashes.items():
             if name in read.notes and content_hash in first:
-                read.notes[name].append(f"It is {first[content_hash]} again; leave one of them out.")
+                read.notes[name].append(f"It is {first[content_hash]} again; exclude one of the two.")
 
         def make(rounds: RoundsWithProgress) -> Correspondence:
             return _register_scans(
@@ -241,7 +239,7 @@ def _new_jobs(finished: _FinishedFolder, change: Change, given: Sequence[FitJob]
         return _jobs_to_add(finished, given)
     finished.check_names(change.redo, "--redo")
     if given and not (change.redo or change.update):
-        raise InputError("--remove takes the names of scans, and no files; leave the files out.")
+        raise InputError("--remove takes the names of scans, and no files; omit the files.")
     by_name = {job.name: job for job in given}
     if given and (unnamed := [name for name in change.redo if name not in by_name]):
         raise InputError(f"None of the given scans is named {unnamed[0]}; rename its file, or give a list with ids.")
@@ -392,10 +390,10 @@ def correspond(
         InputError: options that exclude each other, or too few scans.
     """
     if change and groups:
-        raise InputError(f"--groups cannot be combined with {change.option}; leave one of them out.")
+        raise InputError(f"--groups cannot be combined with {change.option}; omit one of the two options.")
     if subjects and (change or groups):
         other = change.option if change else "--groups"
-        raise InputError(f"--subjects cannot be combined with {other}; leave one of them out.")
+        raise InputError(f"--subjects cannot be combined with {other}; omit one of the two options.")
     if not (change or scans):
         raise InputError("Give scans, or a change of a finished correspondence by --redo, --remove or --update.")
     files = CorrespondFiles(scans, template, model, landmarks, execution, recursive, strict, subjects)

@@ -80,11 +80,11 @@ def write_simulated_faces(
     if area not in (None, "face", "face_and_head"):
         raise InputError(f"The area must be face or face_and_head, not {area!r}.")
     if wide and source == "ict-facekit":
-        raise InputError("People of ICT-FaceKit vary as widely as real ones already; leave --wide out.")
+        raise InputError("People of ICT-FaceKit vary as widely as real people already; omit --wide.")
     if tuple(intensities) != (1.0,) and source == "ict-facekit":
-        raise InputError("Expressions of ICT-FaceKit are written at full intensity; leave --intensity out.")
+        raise InputError("Expressions of ICT-FaceKit are written at full intensity; omit --intensity.")
     if effect_mm is not None and source == "ict-facekit":
-        raise InputError("Effects of sex are put in bundled people only; leave --effect out.")
+        raise InputError("Effects of sex exist for bundled people only; omit --effect.")
     make_folder(output)
     total = subjects * len(expressions)
     with steps(total, "writing", "face", quiet=quiet) as step:

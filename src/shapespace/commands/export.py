@@ -71,7 +71,7 @@ def export(
     for name in wanted:
         results.known(name)
     if wanted and output.resolve() == folder.resolve():
-        raise InputError(f"{output} is the folder of the results itself; give another one.")
+        raise InputError(f"{output} is the folder of the results itself; give another folder.")
     failed: list[str] = []
     if wanted:
         make_folder(output)

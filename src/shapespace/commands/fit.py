@@ -287,7 +287,7 @@ def landmark_files(landmarks: Path | None, scans: int) -> tuple[Path | None, Lan
 
 
 def scan_jobs(given: Sequence[Given], landmarks: Path | None, many: LandmarkFiles, folder: Path) -> list[FitJob]:
-    """Return a job for each scan; one that lies elsewhere is named by its address as by a path.
+    """Return a job for each scan; the address of a remote scan names it as a path does.
 
     Args:
         given: the scans.

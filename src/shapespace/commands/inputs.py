@@ -101,7 +101,7 @@ def with_ids(jobs: Sequence[FitJob], given: Sequence[Given]) -> list[FitJob]:
     """Return `jobs` named by the ids of their scans, if these have ids, with the metadata of the scans.
 
     Raises:
-        InputError: two scans would have one name.
+        InputError: two scans would have the same name.
     """
     named = [
         replace(job, name=scan.called or job.name, metadata=scan.metadata)
@@ -110,7 +110,9 @@ def with_ids(jobs: Sequence[FitJob], given: Sequence[Given]) -> list[FitJob]:
     seen: dict[str, FitJob] = {}
     for job in named:
         if seen.setdefault(job.name.casefold(), job).label != job.label:
-            raise InputError(f"{seen[job.name.casefold()].label} and {job.label} would both be {job.name}; give ids.")
+            raise InputError(
+                f"{seen[job.name.casefold()].label} and {job.label} would both be named {job.name}; give each an id."
+            )
     return named
 
 

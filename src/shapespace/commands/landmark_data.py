@@ -47,9 +47,9 @@ def convert_landmarks(
         to: format: tps, nts, morphoj, csv (a row for each specimen), long (a row for each landmark), or a folder of
             mrk.json or fcsv (default: by the ending of OUT)
         sliders: CSV of the semilandmarks as geomorph has them: before, slide, after, or surface; can be repeated
-        object_name: array of an R file with several, such as plethodon$land
+        object_name: name of the array in an R file with several arrays, such as plethodon$land
         curve_points: points of each curve or outline, at equal distances (default: see `align`)
-        dimensions: 2 or 3, of raw coordinates of MorphoJ whose number fits both (default: by their number)
+        dimensions: 2 or 3, for raw MorphoJ coordinates if their number is divisible by both (default: by their number)
 
     Raises:
         FileError: something cannot be read or written.
@@ -98,7 +98,7 @@ def check_landmarks(
 
         return check_marked(marked, scans, output, say=say)
     if output is not None:
-        raise InputError("-o goes with SAME, the folder that correspond wrote; leave it out.")
+        raise InputError("-o goes with SAME, the folder that correspond wrote; omit -o.")
     raw = read_configurations(marked, sliders=sliders)
     absent = ~raw.observed
     findings = [*_duplicates(raw), *find_other_scales(raw)]
@@ -140,12 +140,14 @@ def _duplicates(raw: LandmarkConfigurations) -> list[str]:
             together[before, label] += before != label
     for (earlier, later), count in together.most_common():
         if count:
-            findings.append(f"Landmarks {earlier} and {later} are at one place in {count} of {len(raw)} specimens.")
+            findings.append(
+                f"Landmarks {earlier} and {later} are at the same place in {count} of {len(raw)} specimens."
+            )
     return findings
 
 
 def find_other_scales(raw: LandmarkConfigurations) -> list[str]:
-    """Return a sentence on each specimen whose size differs so much that its unit or scale is another one."""
+    """Return a sentence on each specimen whose size differs so much that it has another unit or scale."""
     # Root mean squares, which missing landmarks hardly change.
     known = [points[seen] for points, seen in zip(raw.points, raw.observed, strict=True)]
     sizes = np.array(

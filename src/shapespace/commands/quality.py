@@ -57,8 +57,8 @@ class QualityOptions:
     """Measures of quality, and the data that they refer to.
 
     Args:
-        representations: what the modes move, for all targets or one for each; two for one target compare it with
-            itself.
+        representations: vertices or control points that the modes change, one choice for all targets or one for each;
+            with two choices, one target is compared with itself.
         scans: folder of the scans that the surfaces were made from, with the same names, pose and unit: distances are
             measured to these.
         unseen: folder of corresponding shapes that no model was trained on: also measure the error on these.
@@ -110,8 +110,8 @@ def quality(
         targets: models, or folders of meshes in correspondence.
         output: the folder to write to.
         config: folds, modes, samples, seed and gauge.
-        options: what to measure.
-        execution: Executor of folds and random shapes.
+        options: measures and the data that they need.
+        execution: executor of the folds and of the random shapes.
         quiet: no progress.
 
     Raises:
@@ -151,7 +151,7 @@ def quality(
 
 
 def quality_lines(quality: Quality) -> list[str]:
-    """Return the measures with most modes, in words."""
+    """Return one line for each measure at its largest number of modes."""
     out: list[str] = [quality.name]
     for key, unit in _UNITS.items():
         measure = getattr(quality, key)
@@ -244,7 +244,10 @@ def _read_scans(target: _QualityInput, folder: Path | None, *, quiet: bool) -> l
             bar.update()
     for scan in out:
         if not len(scan.vertices) or not np.isfinite(scan.vertices).all():
-            raise MeshError(f"{scan.name}: its vertices are missing or not finite, so nothing can be judged by it.")
+            raise MeshError(
+                f"{scan.name}: its vertices are missing or not finite, so it cannot evaluate a model; "
+                "repair or remove it."
+            )
     return out
 
 
@@ -313,7 +316,7 @@ def _comparison_sentences(targets: Sequence[_QualityInput], differences: dict[st
 def _draw(result: Quality, output: Path, notes: list[str]) -> None:
     """Write the curves as PNG and SVG, if the extra `report` is installed."""
     if importlib.util.find_spec("matplotlib") is None or importlib.util.find_spec("PIL") is None:
-        notes.append('The curves are not drawn; pip install "shapespace[report]" adds what draws them.')
+        notes.append('The curves are not drawn; install the drawing packages with pip install "shapespace[report]".')
         return
     from shapespace.report import figures
 
@@ -359,7 +362,7 @@ class QualityWork:
     """Measures parts, for an executor.
 
     Args:
-        shapes: what all parts share.
+        shapes: shapes and models that all parts share.
     """
 
     shapes: Shared[Shapes]

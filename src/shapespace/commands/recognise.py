@@ -213,7 +213,7 @@ def recognise_transfer(model: Path, person: Path, expression: Path, output: Path
     Raises:
         FileError: something cannot be read, or the mesh not written.
         FileFormatError: a record is damaged.
-        InputError: the model does not separate identity and expression, or a fit is of another one.
+        InputError: the model does not separate identity and expression, or a fit is of another model.
     """
     from shapespace.model.additive import AdditiveModel
 
@@ -224,7 +224,7 @@ def recognise_transfer(model: Path, person: Path, expression: Path, output: Path
         if not record.is_fitted:
             raise InputError(f"{path} is the record of a fit that failed, so there is nothing to transfer.")
         if record.model.hash != additive.shape.content_hash:
-            raise InputError(f"{path} is a fit by another model than {model.name}; fit the scan with this one.")
+            raise InputError(f"{path} is a fit by another model than {model.name}; fit the scan with {model.name}.")
         values = np.asarray(record.z, dtype=np.float64)
         if values.shape != (additive.shape.n_modes,):
             raise InputError(
@@ -256,7 +256,7 @@ def recognise_study(
     """
     if data is None or model is None:
         raise InputError(
-            "A study of scans of your own needs both --data DIR and --model MODEL.h5; the one on simulated people is "
+            "A study of scans of your own needs both --data DIR and --model MODEL.h5; the study on simulated people is "
             "python studies/recognition.py in the source of shapespace."
         )
     from shapespace.study.own_scans import run_own_study  # needs the extras

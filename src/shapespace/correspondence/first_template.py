@@ -72,7 +72,7 @@ def first_template(
     if len(repaired) < FEWEST:
         raise InputError(f"Hardly any of the scans can be used: {'; '.join(broken.values())}")
     if len(copies(list(repaired.values()))) == len(repaired) - 1:
-        raise InputError("All scans are equal, so there is nothing to bring into correspondence; give different ones.")
+        raise InputError("All scans are equal, so there is nothing to bring into correspondence; give different scans.")
     if model is not None:
         mesh, origin = _mean_of(model), "The template is the mean of the model given."
     elif template is not None:
@@ -123,7 +123,7 @@ def repaired_scans(
             broken[i] = f"broken: {error}"
     numbers = list(repaired)
     for copy, earlier in copies(list(repaired.values())).items():
-        notes[numbers[copy]].append(f"It is {repaired[numbers[earlier]].name} again; leave one of them out.")
+        notes[numbers[copy]].append(f"It is {repaired[numbers[earlier]].name} again; exclude one of the two.")
     if config.ignore_colours:
         repaired = {i: replace(scan, colours=None) for i, scan in repaired.items()}
     return repaired, broken, notes

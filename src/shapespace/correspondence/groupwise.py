@@ -249,7 +249,7 @@ class RegistrationState:
         return bool(self.relief_agreement.get(i, 0.0) < usual - by)
 
     def is_mirrored(self, i: int) -> bool:
-        """Return whether scan `i` is a mirror image of the majority, as far as known."""
+        """Return whether scan `i` is a mirror image of the majority, by its registration or the comparisons."""
         if i in self.registrations:
             return self.registrations[i].mirrored
         return bool(self.sides.mirrored[i])
@@ -296,7 +296,7 @@ def _decide_sides(problem: _RunConstants, run: Runner, *, may_reflect: bool) -> 
         if problem.config.pose != "search":  # the frame of a reflected template is not that of any file
             raise InputError(
                 f"--pose {problem.config.pose} cannot be used: the first template is a mirror image of most scans. "
-                "Give one of those as --template, or omit --pose."
+                "Give one of these scans as --template, or omit --pose."
             )
         first = replace(problem.first, mesh=mirror_image(problem.first.mesh))
         usable = np.isin(np.arange(count), list(problem.first.repaired))
@@ -307,7 +307,7 @@ def _decide_sides(problem: _RunConstants, run: Runner, *, may_reflect: bool) -> 
 def _compare_with_anchor(
     problem: _RunConstants, context: RoundContext, anchor: int, run: Runner
 ) -> tuple[_RunConstants, FloatArray]:
-    """Return the problem with the comparisons of all scans with an anchor, and the scores (N, 2) of both sides."""
+    """Return the problem with the comparisons of all scans with an anchor, and scores (N, 2), as given and mirrored."""
     sides: Comparison = "pose" if problem.config.mirror == "never" else "scores"
     tasks = [
         RegistrationTask(i, scan, None, None, problem.config.first, sides=sides)
@@ -575,7 +575,7 @@ def _outlier_reason(registration: ScanRegistration, distance: float) -> str:
 
 
 def _resolve_alternatives(problem: _RunConstants, state: RegistrationState) -> RegistrationState:
-    """If several poses are about equally likely, use the one whose shape the scans of certain pose predict best."""
+    """If several poses are about equally likely, use the pose whose shape the scans of certain pose predict best."""
     sure = [i for i, registration in state.registrations.items() if not registration.alternatives]
     if not _ENOUGH_TO_PREDICT <= len(sure) < len(state.registrations):
         return state
@@ -627,7 +627,7 @@ def _find_evidence(state: RegistrationState) -> dict[int, SurfaceEvidence]:
 
 
 def _consensus_deg(state: RegistrationState, i: int) -> float:
-    """Return the rotation between the pose of a scan and the one on which the comparisons agree (C32); 0 if unknown."""
+    """Return the rotation between a scan's pose and the pose on which the comparisons agree (C32); 0 if unknown."""
     T = None if state.bends else state.consensus.get(i)
     return 0.0 if T is None else angle_deg(T, state.registrations[i].T_scan_template)
 
@@ -984,7 +984,7 @@ def _complete_shapes(problem: _RunConstants, state: RegistrationState) -> dict[i
     """Return the vertices (V, 3) of each registered scan, in the template's frame, with estimates where not observed.
 
     An estimate is the conditional mean by probabilistic PCA of all registered scans (C27). A vertex that fewer than
-    `FEWEST` scans observe, and any vertex of too few scans for a model, keeps its registered position.
+    `FEWEST` scans observe keeps its registered position. If there are too few scans for a model, all vertices do.
     """
     order = sorted(state.registrations)
     shapes, weights = state.shapes(order)

@@ -40,7 +40,7 @@ class Harmonics:
     def of(mesh: Mesh, count: int) -> Harmonics:
         """Return the `count` functions of lowest frequency on `mesh`, which must have triangles; at most V - 2.
 
-        The sign of each function is such that its largest value is positive, so that the same mesh gives the same ones.
+        The largest value of each function is positive, so that the functions of a mesh have fixed signs.
         """
         laplacian, area = cotangent_laplacian(mesh)
         count = min(count, len(area) - 2)

@@ -135,7 +135,7 @@ def bent_shapes(template: IntrinsicShape, scan: IntrinsicShape, seed: int) -> li
 
 
 def distinct(shapes: Iterable[FloatArray], size_mm: float, known: Sequence[FloatArray] = ()) -> list[FloatArray]:
-    """Return those of `shapes` (V, 3) that are apart from the ones before, and from known ones."""
+    """Return those of `shapes` (V, 3) that differ from the shapes before them, and from the known shapes."""
     found: list[FloatArray] = []
     for shape in shapes:
         if all(is_apart(shape, other, size_mm) for other in (*known, *found)):
@@ -209,7 +209,7 @@ def _refine_map(template: IntrinsicShape, scan: IntrinsicShape, start: IntArray,
 
 
 def _orientation(shape: FloatArray, faces: IntArray, normals: FloatArray) -> float:
-    """Return the share of the area of `shape` that faces as the scan does, less that of the rest.
+    """Return the share of the area of `shape` whose normals agree with those of the scan, minus the remaining share.
 
     Args:
         shape: (V, 3) vertices on the scan.

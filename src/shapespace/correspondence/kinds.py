@@ -108,7 +108,7 @@ class Kinds:
     """The kinds of object of a collection.
 
     Args:
-        groups: indices of the shapes that are alike, largest group first; shapes in no group are missing.
+        groups: indices of the shapes of each group of similar shapes, largest group first; some shapes are in no group.
         distance: (N,) distances from the prediction by the largest group, relative to the median of the group.
         relief_agreement: (N,) agreement with the median relief of the largest group (C35); not-a-number if unknown.
     """
@@ -167,7 +167,7 @@ class Collection:
 
     @staticmethod
     def of(shapes: FloatArray, observed: FloatArray, template: FloatArray) -> Collection:
-        """Return a collection at `_POINTS` of the vertices, drawn at random."""
+        """Return the collection of `shapes` at `_POINTS` of their vertices, which are drawn at random."""
         chosen = np.sort(np.random.default_rng(0).permutation(len(template))[:_POINTS])
         return Collection(shapes[:, chosen], observed[:, chosen], template[chosen])
 
@@ -185,9 +185,10 @@ class Collection:
         return rms / max(float(np.median(rms[core])), _LEAST_DISTANCE * rms_size(self.template))
 
     def separate_core(self, candidates: _Indices) -> _Indices:
-        """Return the core of `candidates` (M,) that is most separate from the rest, of some grown from similar ones.
+        """Return the core of `candidates` (M,) that is most separate from the rest; empty if there is none.
 
-        It is empty if there is none. A core of two kinds also predicts both, so the largest one can be mixed.
+        Several cores are grown, each from a few similar shapes. A core of two kinds also
+        predicts both, so the largest core can be mixed.
         """
         aligned, _ = align_to_weighted_mean(self.shapes[candidates], self.observed[candidates], self.template)
         flat = aligned.reshape(len(candidates), -1)

@@ -195,7 +195,9 @@ class MarkedSpecimens:
         target = next((i for i, mesh in enumerate(self.surfaces) if mesh.name == specimen), None)
         sources = {i: marks for i, marks in self.landmarks.items() if i != target}
         if target is None or not sources:
-            raise InputError(f"{specimen}: no surface has this name, or no other specimen is marked; mark another one.")
+            raise InputError(
+                f"{specimen}: no surface has this name, or no other specimen is marked; mark another specimen."
+            )
         surface = self.surfaces[target]
         size = rms_size(surface.vertices)
         names = [name for name in self.names if any(name in marks.names for marks in sources.values())]
@@ -245,8 +247,8 @@ class MarkedSpecimens:
     def suggest(self, count: int = 5) -> list[tuple[str, float]]:
         """Return the specimens to mark next, best first, each given those before it.
 
-        The best specimen is the one that lowers the mean shape distance of all specimens to the nearest marked one
-        most, since errors grow with this distance; without marked specimens it is the medoid.
+        Errors grow with the shape distance to the nearest marked specimen. The best specimen lowers the mean of this
+        distance over all specimens most; without marked specimens it is the medoid.
 
         Returns:
             (name, mean distance to the nearest marked specimen once it is marked, as a share of the size).
@@ -289,7 +291,11 @@ class MarkedSpecimens:
 
 
 def _find_swapped(apart: FloatArray) -> dict[int, int]:
-    """Return index -> index of landmarks whose names are exchanged, from (L, L) distances of given from predicted."""
+    """Return index -> index of landmarks whose names are exchanged.
+
+    Args:
+        apart: (L, L) distance of each given landmark (row) from each predicted landmark (column).
+    """
     straight = apart.diagonal()[:, None] + apart.diagonal()[None]
     ratio = np.where(straight > 0, (apart + apart.T) / np.maximum(straight, 1e-300), 1.0)
     np.fill_diagonal(ratio, 1.0)

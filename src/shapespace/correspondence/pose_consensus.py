@@ -81,7 +81,7 @@ def consensus_poses(comparisons: Sequence[PoseComparison], mirrored: Mapping[int
 def _poses_from(
     root: int, order: Sequence[int], edges: Mapping[int, Sequence[tuple[int, Similarity]]]
 ) -> dict[int, Similarity]:
-    """Return poses from the comparisons with one anchor, each then replaced by the one that most others support."""
+    """Return poses from the comparisons with one anchor, each then replaced by the pose that most others support."""
     poses = {root: Similarity.identity()} | dict(edges[root])
     for _ in range(_STEPS):
         is_changed = False

@@ -45,11 +45,13 @@ class SurfaceEvidence:
     """Comparison of one surface with the shapes of the other scans.
 
     Args:
-        relief_agreement: correlation of its relief with the usual one, transformed to the real line (C35).
-        usual_relief_agreement: median of the scans.
-        consensus_deg: rotation between its pose and the one on which the comparisons with anchors agree (C32).
-        relief_gap: agreement of its relief minus that of another map along the surface of an object that bends;
-            infinite without another map.
+        relief_agreement: correlation of the relief of the surface (its height above its smoothed version) with the
+            median relief of the scans, transformed by arctanh (C35).
+        usual_relief_agreement: median of this agreement over the scans.
+        consensus_deg: rotation between the pose of the surface and the pose on which the comparisons with anchors
+            agree (C32).
+        relief_gap: relief agreement of the surface minus that of the best other map along an object that bends;
+            infinite if there is no other map.
     """
 
     relief_agreement: float
@@ -58,7 +60,11 @@ class SurfaceEvidence:
     relief_gap: float = np.inf
 
     def features(self) -> tuple[float, float]:
-        """Return the evidence against the surface, 0 if there is none: from the consensus, and from its relief."""
+        """Return the evidence against the surface from its pose and from its relief.
+
+        These are 1 if the pose differs from the consensus, else 0; and the difference of the relief agreement from
+        the usual agreement, 0 if the agreement is clear or above the usual.
+        """
         lacking = max(self.usual_relief_agreement - self.relief_agreement, 0.0)
         return float(self.consensus_deg > SAME_POSE_DEG), lacking if self.relief_agreement < _CLEAR else 0.0
 
@@ -90,7 +96,7 @@ def judge(evidence: SurfaceEvidence) -> Judgement:
         doubt = "its limbs may be exchanged: another assignment of its limbs agrees nearly as well"
     elif consensus:
         doubt = (
-            "its pose may be wrong: the comparisons with other scans agree on one that is rotated by "
+            "its pose may be wrong: the comparisons with other scans agree on a pose that is rotated by "
             f"{evidence.consensus_deg:.0f} degrees"
         )
     else:

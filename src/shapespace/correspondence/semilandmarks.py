@@ -94,10 +94,11 @@ class Semilandmarks:
 
     @staticmethod
     def of(specimens: MarkedSpecimens, sets: Sequence[SemilandmarkSet]) -> Semilandmarks:
-        """Return the `sets` on the mean shape.
+        """Return the semilandmarks of the `sets`, placed on the mean shape.
 
         Raises:
-            InputError: an unknown landmark, too few points, a boundary that is not closed, or a name that is not new.
+            InputError: an unknown landmark, too few points, a boundary that is not closed, or a name that another point
+                or set has.
         """
         for k, point_set in enumerate(sets):
             taken = {*specimens.names, *(name for other in sets[:k] for name in (other.name, *other.names))}

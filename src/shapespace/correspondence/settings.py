@@ -37,7 +37,7 @@ class CorrespondConfig:
             reflected (auto), excluded (ask), or the files are trusted (never).
         pose: rotation of the scans: found by a search over all rotations (search), or that of the frames of the files,
             refined by at most 30 degrees (as-given) or 60 degrees (near). Position and size are always found. A scan
-            whose frame is another one is excluded from the second round on, if there are six scans or more.
+            with another frame is excluded from the second round on, if there are six scans or more.
         outer: remove inner surfaces first, such as marrow cavities and trabeculae of CT scans, which are hardly visible
             from outside.
         ignore_colours: match points by place and normal alone, also where scans have colours; for colours that are not

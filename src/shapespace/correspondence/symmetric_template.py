@@ -178,7 +178,7 @@ def _average_landmarks(positions: Mapping[str, FloatArray]) -> tuple[dict[str, F
 
 
 def _mirrored_half(vertices: FloatArray, faces: IntArray, name: str) -> tuple[FloatArray, IntArray, IntArray]:
-    """Return a surface that consists of the half with x > 0 of another one and of its mirror image.
+    """Return a surface that consists of the half of a surface with x > 0 and of the mirror image of this half.
 
     Returns:
         (W, 3) vertices in the order of `SymmetricMesh`, (G, 3) triangles, and (W,) the vertex each of them is from.

@@ -197,7 +197,8 @@ def check_template(template: Mesh) -> Mesh:
     """
     if template.faces is None:
         raise MeshError(
-            f"{template.name} is a point cloud, and a template needs triangles; give a mesh, as MeshLab makes of one."
+            f"{template.name} is a point cloud, and a template needs triangles; give a mesh, for example the "
+            "reconstruction of MeshLab."
         )
     mesh = repair(template)[0]
     if len(mesh.vertices) < _FEWEST:

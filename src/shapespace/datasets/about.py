@@ -12,7 +12,7 @@ ABOUT = "about.json"
 
 
 def write_about(folder: Path, provenance: str, licence: str) -> None:
-    """Write what the meshes in `folder` are.
+    """Write the provenance and the licence of the meshes in `folder`.
 
     Raises:
         FileError: it cannot be written.

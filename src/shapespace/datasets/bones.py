@@ -110,9 +110,10 @@ def write_bones(
     effect_mm: float = EFFECT_MM,
     progress: Callable[[], object] | None = None,
 ) -> Path:
-    """Write bone_000.ply and so on, raw scans of skulls of two groups in turn, and the table bones.csv.
+    """Write raw scans of skulls, bone_000.ply and so on, and the table bones.csv.
 
-    Each has triangles and a pose of its own, and noise; every third has a hole.
+    The skulls belong to two groups alternately. Each scan has noise and its own triangles and pose; every third scan
+    has a hole.
 
     Args:
         folder: output folder; created if it does not exist.

@@ -280,7 +280,7 @@ class FaceGenerator:
             name: name of the mesh; None for one made from person and expression.
 
         Raises:
-            InputError: weights, or a warp, of the wrong number.
+            InputError: another number of weights, or of vertices of a warp, than the generator has.
         """
         if person.warp_mm is not None and person.warp_mm.shape != self._coarse.shape:
             raise InputError("The warp of this person has another number of vertices than the generator.")
@@ -524,14 +524,14 @@ def write_faces(
     if seed < 0:
         raise InputError(f"The seed must be 0 or more, not {seed}.")
     if not expressions or len(set(expressions)) != len(expressions):
-        raise InputError("Give at least one expression, and each one once.")
+        raise InputError("Give at least one expression, and each expression once.")
     for name in expressions:
         if name not in known:
             raise InputError(f"Unknown expression {name!r}; choose one of {', '.join(known)}.")
     if effect_mm is not None and not abs(effect_mm) <= _LARGEST_EFFECT_MM:
         raise InputError(f"The effect must lie between -{_LARGEST_EFFECT_MM} and {_LARGEST_EFFECT_MM} mm.")
     if not intensities or not all(0 < intensity <= 1 for intensity in intensities):
-        raise InputError("Intensities must lie above 0 and at most at 1, and there must be one.")
+        raise InputError("Give one or more intensities, each above 0 and at most 1.")
     folder = make_folder(Path(folder))
     faces = load_faces()
     labels: list[tuple[str, ...]] = []

@@ -116,7 +116,7 @@ def mode_hash(mode: Float32Array) -> str:
 
 
 def read_obj_folder(folder: Path) -> PackedIct:
-    """Return what is kept of the published OBJ files in `folder`: the neutral mesh and as many modes as are there.
+    """Return the packed content of the published OBJ files in `folder`: the neutral mesh and the modes present.
 
     Raises:
         FileError: there is no neutral mesh, or a file cannot be read.
@@ -215,7 +215,7 @@ def check_content(packed: PackedIct, hashes: Mapping[str, str], source: Path) ->
     """Check `packed` against the content `hashes` of the published files, by path such as `FaceXModel/jawOpen.obj`.
 
     Raises:
-        DataError: a mode is missing, or its content is not what was published.
+        DataError: a mode is missing, or its content differs from the published content.
     """
     found_hashes = {NEUTRAL_NAME: neutral_hash(packed.mean, packed.faces)}
     found_hashes |= {f"identity{i:03d}": mode_hash(mode) for i, mode in enumerate(packed.identity)}
@@ -233,7 +233,7 @@ def check_obj(path: Path, neutral: FloatArray | None, expected: str) -> None:
     """Check the content of one OBJ file against its hash; `neutral` (11248, 3) is None for the neutral mesh itself.
 
     Raises:
-        DataError: its content is not what was published.
+        DataError: its content differs from the published content.
         FileError: it cannot be read.
         FileFormatError: it is not a file of ICT-FaceKit.
     """

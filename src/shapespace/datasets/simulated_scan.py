@@ -321,7 +321,7 @@ def _grid(rows: int, columns: int) -> LongArray:
 
 @dataclass(frozen=True, eq=False)
 class _Head:
-    """A sphere fitted to the upper part of a face, bulged to follow it where the face is."""
+    """A sphere fitted to the upper part of a face, with the radius of the face near the vertices of the face."""
 
     center: FloatArray
     radius: float

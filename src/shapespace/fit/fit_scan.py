@@ -88,7 +88,7 @@ class RegionFit:
         return model.landmarks.within(self.part.inside)
 
     def fitted(self, fitted: Fitted, modes: int | None) -> Fitted:
-        """Return the end of the fit with the first `modes` coefficients of the complete model, None for all."""
+        """Return the end of the fit for the complete model, with its first `modes` coefficients; None for all."""
         from shapespace.fit.robust.posterior import variance_of_new_shapes  # compiled, and loads SciPy
 
         full, part, k = self.full, self.part, modes
@@ -418,7 +418,7 @@ class _Recorder:
             )
 
     def driven(self, fitted: Fitted) -> _MethodRun:
-        """Return the run of the method: the recorded states, and `fitted` as their end."""
+        """Return the run of the method, from its recorded states and its end `fitted`."""
         return _MethodRun(self._history, self._ended, self._phase_2_from, fitted)
 
 
@@ -523,13 +523,14 @@ def _note_no_triangles(scan: Mesh) -> list[str]:
 
 
 def _note_large_coefficients(model: ShapeModel, b: FloatArray) -> list[str]:
-    """Note that more coefficients are large than by chance; without a prior faint modes follow details of the scan."""
+    """Return a note if more coefficients are large than by chance; without a prior, faint modes follow scan details."""
     far = int((np.abs(b) > _FAR_OUT * model.stddev[: len(b)]).sum())
     if far <= 1 + _FAR_OUT_BY_CHANCE * len(b):
         return []
     return [
         f"{far} of {len(b)} coefficients lie over {_FAR_OUT:g} standard deviations out; the faint modes follow "
-        "details of the scan that the model does not contain; build it with fewer modes (--modes) for plausible ones."
+        "details of the scan that the model does not contain; build the model with fewer modes (--modes) for plausible "
+        "coefficients."
     ]
 
 

@@ -255,11 +255,11 @@ class FitResult:
             stage: a name of `stages`.
 
         Raises:
-            InputError: another model than the one that was fitted.
+            InputError: another model than the model that was fitted.
         """
         if model is not None and model is not self.model and model.content_hash != self.model_hash:
             raise InputError(
-                f"{self.scan_name} was fitted with another model than the one given, whose surface would be wrong; "
+                f"{self.scan_name} was fitted with another model than the given model, whose surface would be wrong; "
                 "omit the model, as the result contains its own."
             )
         vertices = self._vertices(stage)

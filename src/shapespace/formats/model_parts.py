@@ -319,8 +319,8 @@ class ModelReader:
     Args:
         name: name of the format for `shapespace convert --to`.
         title: description of the format, used in messages.
-        suffixes: endings of file names, lower case; the first is used for writing. A format that is a folder has no
-            ending of another format.
+        suffixes: endings of file names, lower case; the first is used for writing. The ending
+            of a format that is a folder must not be one of another format.
         recognises: function (path, head) -> whether the path looks like this format; `head` are the first bytes, empty
             for a folder. It is fast and never raises.
         read: function path -> model. It raises FileError if the file cannot be read, and ModelFileError if it is

@@ -40,7 +40,7 @@ _AGAIN = "export all files again with the same vertices and triangles"
 
 
 def is_obj_folder(path: Path, head: bytes) -> bool:
-    """Return whether a folder has an OBJ file called neutral and another one with as many vertices and faces."""
+    """Return whether a folder has an OBJ file called neutral and another OBJ file with as many vertices and faces."""
     try:
         neutral, mode_files = _files(path)
         if neutral is None or not mode_files:

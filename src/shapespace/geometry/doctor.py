@@ -185,14 +185,16 @@ class _RepairState:
         what: str,
         action: str,
     ) -> _RepairState:
-        """Return the state without defective elements, with their count and a finding; itself if the count is 0.
+        """Return the state without the defective elements, with their count and a finding in its report.
+
+        If the count is 0, the state itself is returned.
 
         Args:
             without: function that returns the state without these elements.
             measure: name of the field of the report for their count.
             count: number of defective elements.
-            names: singular and plural of the elements, each with the verb.
-            what: end of the sentence about the problem.
+            names: subject and verb of the sentence about the problem, such as `triangle has` and `triangles have`.
+            what: rest of this sentence, such as `no area.`.
             action: sentence about the repair.
         """
         if not count:

@@ -351,7 +351,7 @@ def _normalise(vertices: FloatArray) -> FloatArray:
 
 
 def _best_signs(evidence: FloatArray, anchors: Sequence[int]) -> tuple[FloatArray, float]:
-    """Return the signs (A,) of the anchors, the first +1, with most consistent evidence, and its amount."""
+    """Return the signs (A,) of the anchors for which most evidence is consistent, the first +1, and this evidence."""
     patterns = np.array([(1.0, *signs) for signs in product((1.0, -1.0), repeat=len(evidence) - 1)])
     total = patterns @ evidence
     undisputed = np.abs(total)

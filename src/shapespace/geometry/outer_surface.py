@@ -147,7 +147,7 @@ def _neighbours(vertices: FloatArray, faces: IntArray) -> LongArray:
 
 
 def _patches(is_outer: BoolArray, pairs: LongArray) -> tuple[IntArray, BoolArray]:
-    """Return the patch (F,) of connected outer or hidden triangles, and whether each patch borders on another one."""
+    """Return the patch (F,) of connected outer or hidden triangles, and whether each patch borders on another patch."""
     alike = is_outer[pairs[:, 0]] == is_outer[pairs[:, 1]]
     ends, count = pairs[alike], len(is_outer)
     graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))

@@ -169,9 +169,9 @@ def _move_to_frame(
 def scale_to_tangent(shapes: FloatArray) -> None:
     """Scale each of the aligned `shapes` (N, V, 3) in place to the tangent plane at their mean.
 
-    Shapes of equal size are on a sphere, so to second order they vary along its radius, as by a scaling of the mean. In
-    the tangent plane at the mean, the shapes are the same, and no mode contains the scale of a pose (Dryden and Mardia,
-    Statistical Shape Analysis, 2016, section 4.4).
+    Shapes of equal size are on a sphere. Because it is curved, they also vary along its radius, as if the mean were
+    scaled. Scaled to the tangent plane at the mean they keep their shape, and no mode contains a scale (Dryden and
+    Mardia, Statistical Shape Analysis, 2016, section 4.4).
     """
     flat = shapes.reshape(len(shapes), -1)
     mean = flat.mean(axis=0)

@@ -505,7 +505,10 @@ def _level(field: _Field, voxels: int) -> float:
 
 
 def _find_vanished(mask: BoolArray, side: BoolArray) -> BoolArray:
-    """Return the voxels without a neighbour on their side of `mask` in `side`, and two voxels around these."""
+    """Return the voxels where the object of `mask` or its outside vanished in `side`, and two voxels around these.
+
+    The object has vanished where neither a voxel of `mask` nor a neighbour of it is in `side`; the outside likewise.
+    """
     lost = (mask & ~_dilate(side)) | (~mask & ~_dilate(~side))
     return _dilate(_dilate(lost)) if lost.any() else lost
 

@@ -545,7 +545,9 @@ def _spatial_order(head: _VolumeHeader, path: Path) -> tuple[tuple[int, ...], tu
     others = tuple(axis for axis in range(len(head.shape)) if axis not in head.axes)
     layers = tuple(head.shape[axis] for axis in others if head.shape[axis] > 1)
     if len(layers) > (1 if head.segments else 0):
-        raise InputError(f"{path} has {len(head.shape)} dimensions ({size}), more than one volume; give a label map.")
+        raise InputError(
+            f"{path} has {len(head.shape)} dimensions ({size}), which is more than one volume; give a label map."
+        )
     return (*head.axes, *others), (*(head.shape[axis] for axis in head.axes), *layers)
 
 

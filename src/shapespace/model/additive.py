@@ -346,10 +346,14 @@ def load_model(path: Path) -> ShapeModel | AdditiveModel:
 
 
 def model_of_foreign(foreign: Foreign, path: Path) -> ShapeModel | AdditiveModel:
-    """Return the model in the file `path` of another tool, as an `AdditiveModel` if the file separates its parts.
+    """Return the model of another tool, an `AdditiveModel` if it separates identity and expression.
+
+    Args:
+        foreign: content of the file.
+        path: path of the file.
 
     Raises:
-        ModelFileError: the parts do not make a model.
+        ModelFileError: the arrays of the file do not form a model.
     """
     shape = ShapeModel.of_foreign(foreign, path)
     return shape if foreign.rotation is None else AdditiveModel(shape, foreign.rotation, foreign.n_identity)

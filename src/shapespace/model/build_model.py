@@ -396,9 +396,9 @@ def _align_training_shapes(
 
 
 def _components_of_codes(coder: Representation, shapes: FloatArray, modes: Modes, seed: int) -> PrincipalComponents:
-    """Return mean and basis in codes, orthonormal in the vertices that they decode to; `shapes` is overwritten.
+    """Return mean and basis as codes, for example control points; the basis is orthonormal after decoding to vertices.
 
-    The variation that coding loses counts as variance outside the modes.
+    `shapes` is overwritten. Variation that the codes cannot represent counts as variance outside the modes.
     """
     centre = shapes.mean(axis=0)
     total = sum(float(((shape - centre) ** 2).sum()) for shape in shapes) / (len(shapes) - 1)
@@ -440,7 +440,7 @@ def _check_variation(shapes: FloatArray) -> None:
     """Raise if training shapes have no extent or no variation, before alignment turns rounding into modes."""
     spread = float((np.nanmax(shapes, axis=0) - np.nanmin(shapes, axis=0)).max())
     if spread <= 64 * np.finfo(float).eps * float(np.nanmax(np.abs(shapes))):
-        raise InputError("The training meshes are all equal, so there is no variation to model; give different ones.")
+        raise InputError("The training meshes are all equal, so there is no variation to model; give different meshes.")
 
 
 _ROUNDS = 5  # iterations of spline and alignment to fill holes

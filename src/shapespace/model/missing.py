@@ -1,10 +1,10 @@
 """Models of shapes with missing vertices, which are not-a-number.
 
 Alignment needs complete shapes: an alignment by the observed parts is biased towards them. So shapes are
-completed by probabilistic PCA, aligned as complete shapes are, and completed again, the last time with all modes that
-so many shapes determine. The modes are then those of the completed shapes, with the conditional covariance of the
-missing vertices added to their covariance, so that holes neither narrow nor distort them. Equations Cn are those of
-docs/missing.md.
+completed by probabilistic PCA, aligned as complete shapes are, and completed again, the last time with as many
+modes as the number of shapes determines. The modes of the model are then those of the completed shapes, with the
+conditional covariance of the missing vertices added to their covariance, so that holes neither narrow nor distort them.
+Equations Cn are those of docs/missing.md.
 """
 
 from __future__ import annotations

@@ -102,7 +102,7 @@ class ModelQuality:
     """Quality measures of a shape model; None if the shapes or the model do not determine a measure.
 
     Args:
-        compactness: shares of the variance; the interval is by jackknife over shapes, none for a model alone.
+        compactness: shares of the variance. The interval is from a jackknife over shapes, so a model alone has none.
         generalisation: errors of held-out shapes, mm, surface to surface.
         generalisation_vertices: errors of held-out shapes, mm, vertex to vertex.
         specificity: distances of random shapes, mm, surface to surface.
@@ -299,7 +299,7 @@ class QualityTask:
 
     Args:
         held: indices of the held-out shapes.
-        order: indices of all other shapes, in random order; models of fewer shapes are built from the first ones.
+        order: indices of all other shapes, in random order; models of fewer shapes are built from the first shapes.
         drawn: indices of the random shapes.
     """
 
@@ -576,7 +576,11 @@ def _spread_indices(vertices: int) -> IntArray:
 
 
 def _errors_by_modes(model: ShapeModel, target: _Target, counts: IntArray, *, surface: bool = True) -> FloatArray:
-    """Return the distances (n, 2), mm, of a shape from its reconstructions by the first modes: vertices, surface."""
+    """Return the distances (n, 2), mm, of a shape from its reconstructions by the first `counts` (n,) modes.
+
+    The columns are the mean distance between corresponding vertices and the distance from surface to surface; the
+    second is 0 without `surface`.
+    """
     there, out = target.shape.vertices[target.seen], np.zeros((len(counts), 2))
     T_model_shape = _onto_mean(model, target)
     for column, k in enumerate(counts):
@@ -691,7 +695,7 @@ def _more_shapes(by_shapes: Curve, seed: int) -> str:
     now = 100 * float(1 - each[:, -1].mean() / each[:, few].mean())
     low, high = 100 * np.percentile(fell, [2.5, 97.5])
     changed = f"fell by {now:.0f} %" if now >= 0 else f"rose by {-now:.0f} %"
-    sentence = f"From {counts[few]} to {counts[-1]} training shapes the error on unseen ones {changed} "
+    sentence = f"From {counts[few]} to {counts[-1]} training shapes the error on unseen shapes {changed} "
     sentence += f"(95 %: {low:.0f} to {high:.0f} %), "
     if low > 0 and now >= 5:
         return sentence + "so more shapes would help."

@@ -1,10 +1,10 @@
 """Principal components of shapes in memory or on a disk: equations 1 to 5 of the paper, divisor N - 1.
 
 The (3V, 3V) covariance is never formed. The (N, N) Gram matrix of the centred shapes has the same non-zero eigenvalues;
-it is accumulated over blocks of coordinates, which are centred one by one, so that nothing as large as the data is ever
-copied. Of more than `EXACT` shapes on a disk the modes are found by block Krylov over blocks of rows. The file contains
-the shapes as differences from a template near their mean, in single precision; all sums are in double precision, in one
-order. Alignment is not done here.
+it is accumulated over blocks of coordinates, each of which is centred separately, so that no copy of
+all data is made. For more than `EXACT` shapes on a disk, a block Krylov method computes the modes from blocks of rows.
+The file on the disk contains the differences of the shapes from a template near their mean, in single precision. All
+sums are in double precision and in a fixed order. The shapes must be aligned already.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _NO_VARIANCE = 1e-10
 _ROUNDING, _NO_VARIATION = 64 * float(np.finfo(float).eps), 1e-12
 """Largest difference of coordinates of equal shapes as a share of their size, and for shapes on a disk the share of the
 sum of squares that is rounding error."""
-ALL_EQUAL = "The training shapes are all equal, so there is no variation to model; give different ones."
+ALL_EQUAL = "The training shapes are all equal, so there is no variation to model; give different shapes."
 _TIED = 1.0 - 1e-6
 """Entries this close to a mode's largest tie with it, as left and right do in symmetric shapes."""
 
@@ -281,10 +281,10 @@ class Covariance:
         return Covariance(table, mean, squares)
 
     def total(self) -> float:
-        """Return the trace of C.
+        """Return the total variance, the trace of the covariance.
 
         Raises:
-            InputError: the variation is rounding error.
+            InputError: all rows are equal up to rounding.
         """
         n = self.table.rows
         centred = self.squares - n * float(self.mean @ self.mean)

@@ -87,7 +87,7 @@ class Patterns:
 
     @staticmethod
     def of(observed: BoolArray) -> Patterns:
-        """Return the patterns of shapes whose vertices `observed` (N, V) are known."""
+        """Return the patterns of missing vertices from `observed` (N, V), True at observed vertices."""
         packed, of_vertex, count = np.unique(
             np.packbits(~observed, axis=0).T, axis=0, return_inverse=True, return_counts=True
         )
@@ -145,7 +145,7 @@ def ppca(
 
 
 def _from_complete(shapes: FloatArray, modes: int) -> tuple[FloatArray, float]:
-    """Return W (V, 3, K + 1), whose last column, the mean, is zero, and the noise, most likely for complete shapes."""
+    """Return the likeliest W (V, 3, K + 1) and noise for complete shapes; the last column of W, the mean, is 0."""
     n, vertices = shapes.shape[:2]
     flat = (shapes - shapes.mean(axis=0)).reshape(n, -1)
     values, vectors = np.linalg.eigh(flat @ flat.T)
@@ -199,7 +199,7 @@ def _maximise(
 ) -> tuple[FloatArray, FloatArray, float, float]:
     """Return W (V, 3, K + 1) and its covariance by pattern (C23), the explained squares, and its part of the bound.
 
-    A vertex has its own normal equations, over the shapes that observe it; they differ by the pattern of missing ones.
+    Each vertex has normal equations over the shapes that observe it; the equations differ by pattern.
 
     Args:
         centred: (N, V, 3) centred shapes, zero at missing vertices.

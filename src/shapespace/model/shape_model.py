@@ -290,7 +290,7 @@ class ShapeModel:
 
     @cached_property
     def _modes(self) -> FloatArray:
-        """The basis transposed, (K, D): with each mode in one piece both of its products run at memory speed."""
+        """The transposed basis, (K, D), which is contiguous for each mode, so that products with it are fast."""
         return np.ascontiguousarray(self.basis.T)
 
     @cached_property
@@ -374,7 +374,7 @@ class ShapeModel:
             name = shape.name if isinstance(shape, Mesh) else "The shape"
             raise CorrespondenceError(
                 f"{name} has {len(vertices)} vertices but the model has {self.n_vertices}; only shapes in the "
-                "model's vertex order can be projected; fit this one instead (shapespace fit, or fit_scan)."
+                "model's vertex order can be projected; fit this mesh instead (shapespace fit, or fit_scan)."
             )
         is_observed: BoolArray = ~np.logical_or.reduce(np.isnan(vertices), axis=1)
         if np.isinf(vertices).any() or is_observed.sum() < _FEWEST_OBSERVED:

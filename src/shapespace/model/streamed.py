@@ -286,7 +286,7 @@ def aligned_on_disk(
         alignment_vertices: vertices that determine the alignment, see `align_in_place`.
         scratch: folder for the data from which a build that was killed continues; None takes a temporary folder and
             keeps nothing.
-        onto: shapes to which the new ones are added.
+        onto: shapes to which the new shapes are added.
         modes: modes that will be computed; an impossible number raises before any mesh is read.
         log: function called with the current step.
 

@@ -154,16 +154,16 @@ class SavedClassifier:
         return calibrated(np.asarray(pipeline.predict_proba(z[:, : self.modes])), self.temperature)
 
     def refuse_other_model(self, model_hash: str) -> None:
-        """Raise an error unless `model_hash` is that of the model it was trained with.
+        """Check that `model_hash` is the hash of the model that the classifier was trained with.
 
         Raises:
-            InputError: it is the hash of another model.
+            InputError: the hash is that of another model.
         """
         if model_hash != self.model_hash:
             raise InputError(
                 f"This classifier was trained on coefficients of the model {self.model_hash[:12]}, and these are of "
                 f"{model_hash[:12]}, where they mean something else; fit the scans with the classifier's model, or "
-                "train another one."
+                "train another classifier."
             )
 
     def facts(self) -> dict[str, Any]:

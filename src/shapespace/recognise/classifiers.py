@@ -34,8 +34,9 @@ class NearestMeanDirection(ClassifierMixin, BaseEstimator):
     """The class whose mean direction has the largest cosine with a sample, seen from the origin (the paper, figure 9).
 
     Meant for coefficients relative to the subject's neutral: an expression at another intensity then lies in the same
-    direction. Probabilities are a softmax of the cosines over a temperature, at which the training samples, each left
-    out of its own mean, are most likely. A sample at the origin has no direction and equal probabilities.
+    direction. Probabilities are a softmax of the cosines over a temperature, which maximises the likelihood of the
+    training samples, each excluded from the mean of its class. A sample at the origin has no direction and equal
+    probabilities.
 
     Args:
         temperature: temperature of the softmax; None estimates it in `fit`.

@@ -1,7 +1,7 @@
 """Evaluation of classifiers in subjects who were not trained on.
 
-`predictions` has folds by subject and the nested choice of settings, `classification_scores` the rates, `resampling`
-the tests against shuffled labels and the learning curves. Maps of where classes differ are at the end of this module.
+Permutation tests with shuffled labels, learning curves, the importance of modes, and maps of where classes differ. The
+module `predictions` contains folds by subject, the nested choice of settings, and the rates.
 """
 
 from __future__ import annotations
@@ -369,7 +369,7 @@ def decision_map(
 
 
 def region_shares(decision: FloatArray, regions: Mapping[str, IndexArray]) -> dict[str, float]:
-    """Return each region's share of a decision map (V,): its mean there over the sum of the regions' means.
+    """Return each region's share of a decision map (V,): its mean in the region divided by the sum of these means.
 
     Args:
         decision: (V,) not negative.

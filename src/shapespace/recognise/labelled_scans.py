@@ -130,7 +130,7 @@ def _modes(heads: Sequence[str], path: Path) -> int:
     while f"z{modes + 1}" in known:
         modes += 1
     if not modes or not {"scan", "status", "reason"} <= known:
-        raise FileFormatError(f"{path} is no table of coefficients; give one that shapespace fit wrote.")
+        raise FileFormatError(f"{path} is no table of coefficients; give a table that shapespace fit wrote.")
     if "model_hash" not in known:
         raise FileFormatError(
             f"{path} does not state the model of its coefficients; run shapespace fit to write it again, "

@@ -422,7 +422,8 @@ def _calibrate(
 def predict_scans(saved: SavedClassifier, scans: Sequence[ScanCoefficients]) -> list[ScanPrediction]:
     """Return one prediction per scan, in the order of `scans`.
 
-    A failed fit gets no prediction; a doubtful fit, or a fit below the confidence, gets `UNSURE`; each with its reason.
+    A failed fit gets no prediction. A doubtful fit gets `UNSURE`, and so does a fit whose most probable class has a
+    probability below the confidence of the classifier. In these cases the prediction has a reason.
 
     Raises:
         InputError: the fits are not of the classifier's model, or have fewer modes than it uses.

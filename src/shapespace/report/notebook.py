@@ -342,7 +342,7 @@ def html_of_predictions(predictions: Predictions) -> str:
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], caption: str, total: int) -> list[Block]:
-    """Return a table of the first of `total` rows, and how many there are beyond them."""
+    """Return a table with the first rows, and a sentence with the number of omitted ones of `total` rows."""
     cells = [[Cell(text) for text in row] for row in rows]
     return _shorten(Table([Head(head) for head in heads], cells, caption), total, "more")
 

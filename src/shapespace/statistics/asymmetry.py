@@ -58,8 +58,8 @@ class AnovaRow:
         ss: sum of squares, mm^2.
         df: degrees of freedom: those of the subjects times the dimensions of the shapes (Klingenberg 2002).
         ms: mean square, ss / df.
-        f: ms divided by that of `individual x side`, or for that row by that of the asymmetric error; None without a
-            divisor.
+        f: ms divided by the ms of `individual x side`; for the row `individual x side`, divided by the ms of the
+            asymmetric error; None without a divisor.
         p: p value by permutation; None if nothing can be permuted.
         z: F in standard deviations of its permutation distribution, after a Box-Cox transformation; None without p.
         r2: share of the total sum of squares.
@@ -415,7 +415,8 @@ def _in_reference(
     if ((share > 0) & (share < 1)).any():
         mixed = names[int(np.flatnonzero((share > 0) & (share < 1))[0])]
         raise InputError(
-            f"{cohort.table.where}: some shapes of {mixed} have {column} {value} and others not; give each subject one."
+            f"{cohort.table.where}: some shapes of {mixed} have {column} {value} and others not; give each "
+            "subject one value."
         )
     if share.sum() < _FEWEST:
         raise InputError(
@@ -709,7 +710,10 @@ def _scores(fields: FloatArray, subjects: _Subjects, shared: FloatArray | None) 
 
 
 def _standardise(scores: AsymmetryScores, group: npt.NDArray[np.bool_]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return z, low and high (n,) of scores against those of the group; a member is compared with the other members."""
+    """Return z (n,) of the scores, and of the lower and upper ends of their intervals, relative to the group's scores.
+
+    A member of the group is compared with the other members.
+    """
     inside = scores.mm[group]
     n, total, square = len(inside), inside.sum(), (inside**2).sum()
     less = group.astype(np.float64)

@@ -1,4 +1,4 @@
-"""Rigid alignment of a surface to itself at another time, by the part that did not change: named, or found robustly."""
+"""Rigid alignment of the surfaces of one subject at two times by the unchanged part, which is given or estimated."""
 
 from __future__ import annotations
 

@@ -64,9 +64,10 @@ class Variable:
         name: name of the column; in C() if its numbers denote classes.
         column: internal name of the column.
         levels: classes in order; empty for numbers.
-        groups: classes whose sizes and dispersion count: the levels, or both values of numbers that have only two.
-        low: 5th percentile of numbers; the smaller of two values.
-        high: 95th percentile of numbers; the larger of two values.
+        groups: classes whose sizes and dispersions are checked: the levels, or the two values of a column of numbers
+            with only two; empty for other numbers.
+        low: 5th percentile of numbers, or the smaller value if there are only two.
+        high: 95th percentile of numbers, or the larger value if there are only two.
         middle: mean of numbers.
     """
 
@@ -389,11 +390,13 @@ def _parse_terms(formula: str, table: Table) -> list[list[_Factor]]:
     # Longer names first, as they contain the shorter ones.
     odd = sorted((name for name in table.columns if not re.fullmatch(r"[\w.]+", name)), key=len, reverse=True)
     unquoted = next((name for name in odd if name in _QUOTED.sub("", right)), None)
-    advice = "write one such as '~ sex + age'" if unquoted is None else f"write {quoted(unquoted)} with its backticks"
+    advice = (
+        "write a formula such as '~ sex + age'" if unquoted is None else f"write {quoted(unquoted)} with its backticks"
+    )
     if "~" in plain:
-        raise InputError(f"{where} has something before ~ or a second one; shape is the response, so write '~ sex'.")
+        raise InputError(f"{where} has something before ~, or a second ~; shape is the response, so write '~ sex'.")
     if len(formula) > _LONGEST or stars > _MOST_STARS or powers > 1 or len(re.findall(r"\w+", plain)) > _MOST_NAMES:
-        raise InputError(f"{where} is too long; write a shorter one.")
+        raise InputError(f"{where} is too long; write a shorter formula.")
     if not _PLAIN.fullmatch(plain) or re.search(r"(\*\*|\^)(?!\s*[23]\b)", plain):
         raise InputError(
             f"{where} contains something other than columns, + - * : / ^ and the functions of a formula; {advice}."
@@ -416,7 +419,7 @@ def _parse_terms(formula: str, table: Table) -> list[list[_Factor]]:
     if not keeps_mean:
         raise InputError(f"{where} omits the mean shape, without which effects mean nothing; remove the 0 or - 1.")
     if not drawn:
-        raise InputError(f"{where} names no column; write one such as '~ sex + age'.")
+        raise InputError(f"{where} names no column; write a formula such as '~ sex + age'.")
     return drawn
 
 

@@ -69,10 +69,11 @@ class EffectMap:
         length_mm: (V,) length of the change, mm.
         along: test of `normal_mm`; None for points.
         any_way: test of `change_mm` in any direction.
-        bump_mm: (V,) height of the bump at the vertex that explains the change best; None if none were searched for.
+        bump_mm: (V,) height, for each vertex, of the bump centred there that explains the change best; None if no bumps
+            were searched for.
         bump: test of `bump_mm`.
-        weight: (V,) factor of F, the share of the information that the observations contain (`information`); 0 where
-            the map is blank. None if all vertices are observed.
+        weight: (V,) factor by which F is multiplied: the share of the information at each vertex that the observations
+            contain (`information`); 0 where the map is blank. None if all vertices are observed.
     """
 
     change_mm: FloatArray

@@ -184,16 +184,16 @@ class WithinSubjects:
         if not s:
             raise InputError(
                 f"In {self.design.formula!r} no {self.blocks} has shapes in all conditions that {label} needs; remove "
-                "it, or exclude classes with few shapes."
+                "this effect, or exclude classes with few shapes."
             )
         terms, between = self._between_design(effects)
         first = np.array([np.flatnonzero(self.subject_of_cell == subject)[0] for subject in responses.subjects])
         matrix = between.matrix[self.rows[first]]
         if s - matrix.shape[1] < 1:
             raise InputError(
-                f"In {self.design.formula!r} only {s} of {self.count} blocks have shapes in the conditions that "
-                f"{label} needs, too few for {matrix.shape[1]} columns between them; remove it, or exclude "
-                "classes with few shapes."
+                f"In {self.design.formula!r} only {s} of {self.count} {self.blocks}s have shapes in the conditions "
+                f"that {label} needs, too few for {matrix.shape[1]} columns between {self.blocks}s; remove this "
+                "effect, or exclude classes with few shapes."
             )
         columns = np.arange(matrix.shape[1], dtype=np.intp)
         check_not_aliased(matrix, columns, terms, self.design, where)
@@ -260,9 +260,9 @@ class WithinSubjects:
 def _weights(responses: SubjectResponses, matrix: FloatArray) -> FloatArray:
     """Return the (s,) weights of subjects in a model (s, q) of their responses; 1 for all if they are equally precise.
 
-    The variance of a response is that between subjects plus that of its estimate. The share of the latter is the value
-    of `_SHARES` with the highest restricted likelihood (Patterson and Thompson, Biometrika 58, 1971), the same for all
-    coordinates.
+    The variance of a response is the sum of the variance between subjects and the variance of its estimate. The share
+    of the second is the value of `_SHARES` with the highest restricted likelihood (Patterson and Thompson, Biometrika
+    58, 1971), the same for all coordinates.
     """
     v = responses.variances
     if np.ptp(v) <= _ESTIMABLE:
@@ -285,9 +285,14 @@ def _weights(responses: SubjectResponses, matrix: FloatArray) -> FloatArray:
 
 
 def _estimate(values: FloatArray, wanted: FloatArray) -> tuple[FloatArray | None, FloatArray | None]:
-    """Return the weights (d, c) of centred cells (c, D) that estimate contrasts (D, d), and their products (d, d).
+    """Return the weights (d, c) of cells by which their responses estimate contrasts, and the weights' products (d, d).
 
-    None if the cells do not determine all contrasts.
+    Both are None if the cells do not determine all contrasts.
+
+    Args:
+        values: (c, D) centred columns of the design in the cells.
+        wanted: (D, d) contrasts.
+
     """
     u, s, vt = np.linalg.svd(values, full_matrices=False)
     seen = s > _ESTIMABLE * np.sqrt(len(values))
@@ -452,7 +457,10 @@ def _no_effect_error(effect: frozenset[str], design: Design) -> InputError:
 
 
 def _cells(design: Design, who: Rows, varying: set[str]) -> tuple[Rows, Rows]:
-    """Return a row of each cell, in the order of the table, and the (N,) cell of each row."""
+    """Return the first row of each cell, in the order of the table, and the (N,) cell of each row.
+
+    A cell consists of the rows of one subject (`who`) that are equal in all `varying` variables.
+    """
     values = [design.values[name] for name in sorted(varying)]
     numbers: dict[tuple[object, ...], int] = {}
     rows, cell = list[int](), list[int]()

@@ -226,7 +226,10 @@ class UnequalVariances:
     seed: int
 
     def signs(self) -> Iterator[tuple[int, FloatArray]]:
-        """Yield (start, factors (b, n)) of the residuals, the same in each call; the first row is 1."""
+        """Yield (number of the first row, factors (b, n) of the residuals) in batches; the first row of all is 1.
+
+        Each call yields the same factors.
+        """
         n = len(self.residual)
         for start in range(0, self.permutations, _BATCH):
             rng = np.random.default_rng([self.seed, 4, start])

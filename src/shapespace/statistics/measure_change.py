@@ -158,7 +158,7 @@ def _indicator(vertices: IntArray, n_vertices: int) -> FloatArray:
 
 
 def _is_model_only(cohort: Cohort) -> bool:
-    """Return whether the surfaces are the model's own, up to the rounding of files."""
+    """Return whether the first surface is the reconstruction by its model, up to the rounding of files."""
     if cohort.fitted is None:
         return False
     reconstruction, surface = cohort.fitted.model.reconstruct(cohort.fitted.b[0]), cohort.vertices(0)
@@ -275,7 +275,7 @@ def _draft(problem: _SharedEstimates, name: str, subject: AlignedVisits) -> _Sub
 def _uncertainty(
     problem: _SharedEstimates, subject: AlignedVisits, weights: FloatArray, noise_ratio: float
 ) -> ChangeUncertainty:
-    """Return the standard deviations of a sum over visits by `weights` (T,); 0 if rescans replace them.
+    """Return the standard deviations of the sum over visits weighted by `weights` (T,); 0 if rescans determine them.
 
     `noise_ratio` is the noise of the sum divided by that of the difference of the last visit and the first.
     """

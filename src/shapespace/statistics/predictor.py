@@ -156,8 +156,9 @@ class Predictor:
         own = model_hash_of(cohort)
         if own != self.model_hash:
             raise CorrespondenceError(
-                f"{self.target} was learned from {'fits by another model' if self.model_hash else 'surfaces'}, and the "
-                f"new shapes are {'fits by this one' if own else 'surfaces'}; give shapes like the training shapes."
+                f"{self.target} was learned from {'fits by one model' if self.model_hash else 'surfaces'}, but the new "
+                f"shapes are {'surfaces' if not own else 'fits by another model' if self.model_hash else 'fits'}; "
+                "give shapes like the training shapes."
             )
         if cohort.gauge != self.gauge:
             raise InputError(f"{self.target} was learned in the gauge {self.gauge}, not {cohort.gauge}; read the new "

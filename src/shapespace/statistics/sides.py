@@ -73,8 +73,9 @@ class Sides:
     def chord_heights(self, mean: FloatArray, normals: FloatArray) -> FloatArray:
         """Return the height (M,) of the curved surface above its triangle at the mirror image of each vertex.
 
-        Each vertex lies on the surface, and would seem to be further out than the other side. Near the plane, where
-        sides hardly vary, this would look like directional asymmetry. The height is exact for quadratic surfaces: half
+        A vertex is on the curved surface, but its mirror image is interpolated on a flat triangle, below the surface.
+        Without this height the vertex would seem to be further out than the other side. Near the mirror plane, where
+        sides hardly vary, that would look like directional asymmetry. The height is exact for quadratic surfaces: half
         of the projection of Boubekeur and Alexa (Phong tessellation, 2008).
 
         Args:
@@ -112,7 +113,7 @@ class Sides:
 
 
 def find_sides(cohort: Cohort) -> Sides:
-    """Return the sides of an object from the mean of its cohort, or from the mean of the model of fits.
+    """Return the sides of an object from the mean of its cohort, or of the model if the cohort consists of fits.
 
     Raises:
         InputError: it has no triangles, or it is not symmetric about any plane.
@@ -138,7 +139,7 @@ def find_sides(cohort: Cohort) -> Sides:
     if rival <= SYMMETRIC_SHARE:
         notes.append(
             f"The mean has another plane of symmetry, {100 * rival:.2f} % of its size off compared with "
-            f"{100 * symmetry.off_share:.2f} %; if that is the one you mean, name the pairs with --pairs."
+            f"{100 * symmetry.off_share:.2f} %; if you mean that plane, name the pairs with --pairs."
         )
     everything = np.arange(cohort.n_vertices, dtype=np.int32)
     other = mirror_pairs(mesh, symmetry)
@@ -181,7 +182,7 @@ def given_sides(cohort: Cohort, pairs: Sequence[tuple[int, int]], where: str = "
                 )
         if other.get(a, b) != b or other.get(b, a) != a:
             twice = (a if other.get(a, b) != b else b) + first
-            raise InputError(f"{where}: the {noun} {twice} is in two pairs; keep one.")
+            raise InputError(f"{where}: the {noun} {twice} is in two pairs; keep one of the pairs.")
         other[a], other[b] = b, a
     notes: tuple[str, ...] = ()
     single = [v for v in range(cohort.n_vertices) if v not in other]
@@ -211,8 +212,9 @@ def given_sides(cohort: Cohort, pairs: Sequence[tuple[int, int]], where: str = "
     share = off / rms_size(x)
     if share > LARGEST_PAIRED_OFF:
         raise InputError(
-            f"{where}: the mean lies {100 * share:.0f} % of its size from its mirror image by them, and "
-            f"{100 * LARGEST_PAIRED_OFF:.0f} % is the most; check that each row names points that mirror each other."
+            f"{where}: the mean lies {100 * share:.0f} % of its size from its mirror image by these "
+            f"pairs, and at most {100 * LARGEST_PAIRED_OFF:.0f} % is allowed; check that each row names points that "
+            "mirror each other."
         )
     left = cohort.n_vertices - len(vertices)
     notes += (f"{left} of {cohort.n_vertices} vertices are in no pair of {where} and are excluded.",) if left else ()

@@ -81,7 +81,7 @@ class StoredFile(Struct, frozen=True, kw_only=True):
         except OSError as error:
             raise read_error(path, error) from error
         if hashlib.sha256(end).hexdigest() != self.end_sha256:
-            raise FileFormatError(f"{path} is damaged: its content is not what was written; {AGAIN}.")
+            raise FileFormatError(f"{path} is damaged: its content has changed since it was written; {AGAIN}.")
         return path
 
     def verify(self, root: Path) -> Path:
@@ -93,7 +93,7 @@ class StoredFile(Struct, frozen=True, kw_only=True):
         """
         path = self.path(root)
         if sha256_of_file(path) != self.sha256:
-            raise FileFormatError(f"{path} is damaged: its content is not what was written; {AGAIN}.")
+            raise FileFormatError(f"{path} is damaged: its content has changed since it was written; {AGAIN}.")
         return path
 
 

@@ -449,7 +449,7 @@ def _store_at(_resolved: Path, folder: Path, _changed: int) -> ResultStore | Non
 
 
 def _stored_at(path: Path) -> tuple[Results, str, str] | None:
-    """Return the store with the content of the file `path`, its name and kind there; None without such a store."""
+    """Return the store with the content of the file `path`, and its name and kind there; None if no store has it."""
     name, kind = split_file_name(path.name)
     if not kind or path.is_file() or (results := results_at(path.parent)) is None:
         return None

@@ -314,7 +314,7 @@ class FieldMatches:
 def _first_matches(
     target: ScanTarget, surface: ModelSurface, T: Similarity, settings: DenseSettings
 ) -> tuple[Matcher, FieldMatches]:
-    """Return the matcher, with triangles that are flat or stand for a smooth surface, and the first matches.
+    """Return the matcher and the first matches; it measures distances from flat triangles, or from a smooth surface.
 
     Raises:
         FitError: hardly any point of the scan matches the surface.

@@ -472,7 +472,7 @@ def chirality_of(mirrored_log_odds: float | None, mirrored_bound: float | None) 
 
 
 def is_side_undecidable(evidence: FitEvidence) -> bool:
-    """Return whether the mirror image of the scan was fitted, and neither side is clearly the right one."""
+    """Return whether the mirror image of the scan was fitted too, and it remains open which of the two is right."""
     is_undecidable = chirality_of(evidence.mirrored_log_odds, evidence.mirrored_bound) == "undecidable"
     return is_undecidable and evidence.mirrored_apart_mm is not None
 

@@ -20,7 +20,7 @@ of those that move further have vertices in wrong positions (docs/dense.md)."""
 
 
 def judge(method: Method, ended: FitOutcome) -> tuple[Status, tuple[Reason, ...]]:
-    """Return status and reasons of a fit: contradictions in the result, then the doubts of the method."""
+    """Return status and reasons of a fit: contradictions in the result first, then the method's reasons for doubt."""
     doubts = [*find_contradictions(ended), *method.doubts(ended)]
     if doubts:
         return "doubtful", tuple(doubts)

@@ -131,12 +131,12 @@ class ModelSurface:
     def closest(
         self, points: FloatArray, vertex: IntArray, triangle: IntArray
     ) -> tuple[IntArray, IntArray, FloatArray]:
-        """Find the closest points by walking over the surface from a vertex and a triangle near each.
+        """Find the closest point to each query point by walking over the surface from its last match.
 
         Args:
             points: (M, 3) query points, mm.
             vertex: (M,) vertex from which each walk starts.
-            triangle: (M,) triangle near it; -1 if none is known.
+            triangle: (M,) triangle of the last match of each point; -1 if unknown.
 
         Returns:
             (M,) vertex where each walk ends, (M,) triangle of the closest point, (M, 3) barycentric coordinates.

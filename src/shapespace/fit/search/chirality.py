@@ -100,9 +100,10 @@ def compare_with_mirror_image(
 def _compare(
     model: ShapeModel, target: ScanTarget, fitted: Fitted, settings: RobustSettings, *, with_scale: bool
 ) -> tuple[float, RobustFitted | None] | None:
-    """Return the log odds that a scan is mirrored, and the fit to its mirror image if its pose fits about as well.
+    """Return the log odds that a scan is mirrored, and the fit to its mirror image.
 
-    It returns None if the pose search fails.
+    The fit is None if the mirror image fits clearly worse, or cannot be fitted. The function returns None if the pose
+    search of the scan as given fails.
     """
     from shapespace.fit.search.pose_search import MIDDLE, refine  # compiled
 

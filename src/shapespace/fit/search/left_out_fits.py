@@ -1,4 +1,4 @@
-"""Fits of training shapes, each by the model of the other shapes: the reference for a correct scan of a new shape."""
+"""Fits of training shapes, each by the model of the other shapes: the reference for fits of correct new scans."""
 
 from __future__ import annotations
 

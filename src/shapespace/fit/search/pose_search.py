@@ -137,7 +137,7 @@ class SearchStep(NamedTuple):
     """Settings of one step of the search.
 
     Args:
-        points: number of points of each side that are matched to the other.
+        points: number of points of the model that are matched to the scan, and of the scan to the model.
         widest: reach of the weights in the first iteration, as a share of the model's size.
         narrowest: reach of the weights in the last iteration, as a share of the model's size.
         iterations: number of iterations; the reach decreases geometrically.

@@ -117,7 +117,7 @@ def is_ours(path: Path) -> bool:
 
 
 def read_hdf5(path: Path) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Attribute]]:
-    """Return the arrays (read-only) and attributes in `path`, checked against both hashes.
+    """Return the arrays (read-only) and attributes in `path`, checked against the checksum and the content hash.
 
     Raises:
         FileError: the file cannot be read.
@@ -137,8 +137,8 @@ def read_hdf5(path: Path) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Attrib
         if SIGNATURE in data[: 2 * _USER_BLOCK]:
             raise damaged
         raise FileFormatError(
-            f"{path} is not an HDF5 file, nor a model of another tool; give one that shapespace build wrote, or one in "
-            "a format that shapespace convert --help names."
+            f"{path} is neither an HDF5 file nor a model of another tool; give a model that shapespace build wrote, or "
+            "a model in a format that shapespace convert --help names."
         )
     if data[:_USER_BLOCK] != _user_block(memoryview(data)[_USER_BLOCK:]):
         raise damaged

@@ -38,7 +38,14 @@ _NTS_MISSING = -999.0
 def coordinates(
     cells: Iterable[str], path: Path, describe: Callable[[int], str], noun: str = "coordinate"
 ) -> list[float]:
-    """Return the numbers in cells, NaN for missing values; `describe` returns the owner of a cell for messages."""
+    """Return the numbers in cells, NaN for missing values.
+
+    Args:
+        cells: texts of the cells.
+        path: path of the file, for messages.
+        describe: function from the number of a cell to its specimen or landmark, for messages.
+        noun: noun for the numbers, for messages.
+    """
     numbers: list[float] = []
     for at, cell in enumerate(cells):
         try:

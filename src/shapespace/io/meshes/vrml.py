@@ -42,9 +42,9 @@ _KNOWN = {b"USE", b"ccw", b"vertexOrdering", *_FIELDS}
 
 
 def _replace_decimal_commas(text: bytes, path: Path) -> bytes:
-    """Return the coordinates of points with decimal points.
+    """Return the text of coordinates with decimal points in place of decimal commas.
 
-    Commas separate numbers in VRML. If they only separate points, fewer than half of the words contain a comma.
+    In VRML commas may also separate points; then fewer than half of the words contain a comma, and they are kept.
     """
     if _TIGHT_COMMA.search(text):
         spaced = _LAST_COMMA.sub(b" ", text)

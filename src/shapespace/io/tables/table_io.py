@@ -143,7 +143,7 @@ def table_rows(content: bytes) -> Iterator[list[str]]:
         known = [name for name in header if name]
         if len(set(known)) != len(known):
             repeated = next(name for name in known if known.count(name) > 1)
-            raise ValueError(f"has two columns of one name ({repeated[:40]!r})")
+            raise ValueError(f"has two columns of the same name ({repeated[:40]!r})")
         yield header
         checksum_column, n_unchecked = header.index(CHECKSUM) if CHECKSUM in header else None, 0
         for number, row in enumerate(lines, 1):

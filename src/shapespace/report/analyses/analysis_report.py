@@ -238,7 +238,7 @@ class AnalysisReport:
         Args:
             question: the command.
             title: title of the report.
-            content: parts and tables in their order; a table without a title is a file alone.
+            content: parts and tables in their order; a table without a title is only written as a file.
             **known: further fields of the report.
         """
         every = tuple(content)

@@ -256,7 +256,7 @@ _EXPLORATORY = "exploratory, since its term is not significant: "
 
 
 def _map_sentence(result: CompareResult, effect: ShapeEffect, effect_map: EffectMap) -> str:
-    """Return what the map of an effect shows; it is exploratory where no term of the effect is significant."""
+    """Return a sentence on the map of an effect; the map is exploratory if no term of the effect is significant."""
     level = result.config.alpha
     scope = f"family-wise error {100 * level:g} % within this map"
     significant = effect_map.test.p_family <= level

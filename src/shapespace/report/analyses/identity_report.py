@@ -271,7 +271,7 @@ def _identification_parts(result: IdentificationResult) -> tuple[Part, ...]:
                 f"{result.enrolled} subjects are enrolled"
                 + (" in each part at least." if len(result.trial.rounds) > 1 else ".")
                 + " A subject's score is that of its most similar scan; ties count against the"
-                f" right one. {_INTERVALS}",
+                f" right subject. {_INTERVALS}",
             ),
         ),
     )  # fmt: skip

@@ -131,7 +131,7 @@ def morphospace_part(
     if first[0] == first[1] or not all(1 <= axis <= shown for axis in first):
         raise InputError(
             f"Axes {first[0]},{first[1]} cannot be drawn, since this ordination has {len(shape_axes)}; name two "
-            f"different ones from 1 to {len(shape_axes)}."
+            f"different axes from 1 to {len(shape_axes)}."
         )
     arrays: dict[str, npt.NDArray[Any]] = {
         "scores": scores[:, :shown],

@@ -1,4 +1,4 @@
-/* Colour bars, and what the colours of a fit's distances mean. */
+/* Colour bars, and the meaning of the colours of a fit's distances. */
 (function () {
   "use strict";
 

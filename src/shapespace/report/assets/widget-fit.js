@@ -115,7 +115,7 @@
       const scan = arrays.scan ? layer("scan", "Scan", 0) : null, model = layer("model", "Model", 100);
       const maps = [["none", "plain"]];
       if (arrays.scan) maps.push(["model", "distance, model to scan"], ["scan", "distance, scan to model"]);
-      if (arrays.regions) maps.push(["regions", "what the fit used"]);
+      if (arrays.regions) maps.push(["regions", "regions that the fit used"]);
       if (arrays.colours_final && arrays.scan_colours) maps.push(["colour", "colour of the scan"]);
       const called = (name) => (name === "final" && !stages.includes("initial") ? "Fitted" : STAGES[name] || name);
       if (stages.length > 1) {

@@ -133,7 +133,7 @@
     return known.length ? known[Math.min(known.length - 1, Math.floor(share * known.length))] : NaN;
   }
 
-  /** The unpacked arrays of a payload: an id or element with base64 inside, bytes, or what is unpacked already. */
+  /** The unpacked arrays of a payload: an id or element with base64 inside, bytes, or data that are already unpacked. */
   Shapespace.load = async function (source) {
     if (source && source.arrays) return source;
     if (source instanceof ArrayBuffer) return Shapespace.unpack(source);

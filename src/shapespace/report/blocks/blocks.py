@@ -83,7 +83,7 @@ class Table:
 
     @property
     def long(self) -> bool:
-        """Whether the table scrolls within itself, under its heads."""
+        """Whether the table has so many rows that they scroll below fixed column heads."""
         return len(self.rows) > self.MOST_OPEN
 
 

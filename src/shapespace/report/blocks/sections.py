@@ -360,7 +360,7 @@ def distances_text(fit: SavedFit) -> str:
     overlap = fit.record.shown
     seen, covered = (overlap.model_seen_share, overlap.scan_covered_share) if overlap else (None, None)
     return (
-        f"On average, over what the scan shows: model to scan {to_scan}{_over(seen, 'model')}, scan to model "
+        f"On average, over the parts that the scan shows: model to scan {to_scan}{_over(seen, 'model')}, scan to model "
         f"{to_model}{_over(covered, 'scan')}."
     )
 
@@ -703,7 +703,7 @@ def described(cls: type) -> dict[str, str]:
 
 
 def _numbers(key: str, values: Mapping[str, Any], part_name: str) -> list[Block]:
-    """Return the settings of one part of the fit as tables of words."""
+    """Return tables of the settings of one part of the fit, with their meaning."""
     out: list[Block] = []
     rows: list[list[str]] = [
         ["all" if step.get(name) is None else _level(name, step[name]) for name in _LEVEL]
@@ -755,7 +755,7 @@ def _unit(config: Mapping[str, Any]) -> str:
 
 def _scale(config: Mapping[str, Any]) -> str:
     effect = str(config.get("scale_in_effect", config.get("scale")))
-    text = {"free": "free: each fit finds its own", "fixed": "fixed: scans and model are of one size"}.get(
+    text = {"free": "free: each fit finds its own", "fixed": "fixed: scans and model have the same size"}.get(
         effect, plain(effect)
     )
     return f"{text}, as the model is made" if config.get("scale") == "auto" else text

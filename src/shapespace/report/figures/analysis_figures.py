@@ -67,7 +67,9 @@ _MOST_BINS = 2000  # above the pixels of a figure nothing is gained
 
 
 def views_of(mesh: Mesh) -> list[tuple[str, FloatArray, float]]:
-    """Return the views of a mesh, those of the orientation first of all: name, rotation (3, 3), and yaw after it.
+    """Return the views of a mesh: name, rotation (3, 3), and yaw (degrees) after the rotation.
+
+    These are the views of the current orientation, or of `upright_views` if it has none.
 
     Raises:
         InputError: see `upright_views`.
@@ -229,7 +231,7 @@ def histogram_figure(
         y: name of the counts, such as `share` if they are divided by their sum.
         observed: position of a line, such as a statistic among its permutations; None for no line.
         observed_label: label of the line.
-        title: above the figure.
+        title: text above the figure.
 
     Raises:
         InputError: edges that do not rise, counts of another length or below 0, or nothing to draw.
@@ -282,7 +284,7 @@ def checkerboard_figure(
         surfaces: (V, 3) each, moved onto the mean shape; NaN where missing.
         labels: one label per surface.
         yaw_deg: angle of the camera from the front, degrees.
-        title: above the figure.
+        title: text above the figure.
 
     Raises:
         InputError: no surfaces, too many for one figure, or another number of labels.
@@ -321,7 +323,7 @@ def missing_figure(mean: Mesh, missing_share: FloatArray, *, title: str = "") ->
     Args:
         mean: the mean shape, upright.
         missing_share: (V,) 0 to 1.
-        title: above the figure.
+        title: text above the figure.
     """
     largest_share = float(missing_share.max(initial=0.0))
     return _from_four_sides(
@@ -344,7 +346,7 @@ def position_std_figure(mean: Mesh, position_std: FloatArray, limit: float, *, t
         mean: the mean shape, upright.
         position_std: (V,) shares of the size.
         limit: end of the scale, percent.
-        title: above the figure.
+        title: text above the figure.
     """
     return _from_four_sides(
         mean,
@@ -370,7 +372,7 @@ def nearness_figure(distances: FloatArray, *, title: str = "") -> Figure:
 
     Args:
         distances: (N, 4) mean, 95 %, 99 % and largest distance of each scan, as shares of its size.
-        title: above the figure.
+        title: text above the figure.
 
     Raises:
         InputError: there are none.
@@ -409,7 +411,7 @@ def movement_figure(
         rounds: RMS of each round, shares of the size.
         scans: RMS of each round of each scan; scans that missed a round are omitted.
         settled_share: movement below which the rounds end, share of the size.
-        title: above the figure.
+        title: text above the figure.
 
     Raises:
         InputError: there are no rounds.
@@ -461,7 +463,7 @@ def confusion_figure(counts: npt.ArrayLike, classes: Sequence[str], *, title: st
     Args:
         counts: (C, C) number of samples of the row's class that were predicted to be of the column's class.
         classes: names of the C classes.
-        title: above the figure; by default the accuracy.
+        title: text above the figure; by default the accuracy.
 
     Raises:
         InputError: counts of another shape or below 0, no sample at all, or more than 40 classes.
@@ -547,7 +549,7 @@ def calibration_figure(
             answers (all 0 to 1), and the number of answers. Bins without answers are omitted.
         ece: expected calibration error, 0 to 1, None if it is unknown.
         brier: Brier score, 0 to 1; None if it is unknown.
-        title: above the figure; by default the calibration error.
+        title: text above the figure; by default the calibration error.
 
     Raises:
         InputError: bins of another shape, no answer in any bin, or shares that are not within 0 to 1.
@@ -610,7 +612,7 @@ def learning_curve_figure(
         high: (n,) upper end of the interval, 0 to 1; None if it is unknown.
         band: name of the interval.
         ceiling: upper bound of the accuracy, 0 to 1; None if it is unknown.
-        title: above the figure; by default the first and last accuracy.
+        title: text above the figure; by default the first and last accuracy.
 
     Raises:
         InputError: lists that are empty or of different lengths.
@@ -663,7 +665,7 @@ def curve_figure(
         series: name (empty for none), (n,) x values and (n,) y values of each line.
         x: name and unit of the x values.
         y: name and unit of the y values.
-        title: above the figure; by default y against x.
+        title: text above the figure; by default y against x.
         bands: lower and upper ends (n,) of a band around each series, NaN where unknown; None for a series without a
             band.
         dots: whether each series is drawn as dots without a line.

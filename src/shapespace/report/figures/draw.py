@@ -676,7 +676,7 @@ def _with_fonts(svg: bytes) -> bytes:
 
 
 def _subset(weight: int, letters: str) -> bytes:
-    """Return the font of all figures, WOFF, with some letters alone."""
+    """Return the font of all figures as WOFF, reduced to the characters in `letters`."""
     subset: Any = import_module("fontTools.subset")
     options = subset.Options(flavor="woff", recalc_timestamp=False, layout_features=[], notdef_outline=True)
     options.drop_tables += ["FFTM"]

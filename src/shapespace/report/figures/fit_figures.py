@@ -129,7 +129,7 @@ def signed_maps(fit: StagedFit, stage: str = "final", *, limit_mm: float | None 
         fit: fit with the stage.
         stage: `before`, `initial`, `final` or `dense`.
         limit_mm: end of the colour scale, mm; None for a limit that contains nearly all distances.
-        title: above the figure.
+        title: text above the figure.
 
     Raises:
         InputError: the fit has no such stage, or the limit is not positive.
@@ -315,7 +315,7 @@ def coefficients_figure(fit: StagedFit, population: FloatArray | None = None, *,
     Args:
         fit: fit with z, b_stddev and shrinkage.
         population: (N, K) z of the training set; None draws the 95 % range of a normal population.
-        title: above the figure.
+        title: text above the figure.
 
     Raises:
         InputError: the population has another number of coefficients.
@@ -459,7 +459,7 @@ def error_curves(fits: Sequence[StagedFit], *, stage: str = "final", title: str 
     Args:
         fits: fits, each drawn as a thin curve over the vertices that its scan shows; a thick curve is that of all fits.
         stage: stage of the fits.
-        title: above the figure.
+        title: text above the figure.
 
     Raises:
         InputError: there is nothing to draw, or a fit lacks the stage.

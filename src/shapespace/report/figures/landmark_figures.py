@@ -129,7 +129,7 @@ def landmark_map_figure(
         mask: (L,) landmarks in full colour, the others are small and pale; None for no mask.
 
     Raises:
-        InputError: another number of values or flags than of landmarks, or no finite value.
+        InputError: the number of values or of mask entries is not that of the landmarks, or no value is finite.
     """
     if values.shape != (len(points),) or (mask is not None and mask.shape != values.shape):
         raise InputError(f"{len(points)} landmarks need one number each, not {values.shape}.")

@@ -93,7 +93,7 @@ def modes_figure(model: ShapeModel, modes: int = 5, deviations: float = 3.0, *, 
         model: the shape space.
         modes: largest number of modes.
         deviations: standard deviations to each side.
-        title: above the figure.
+        title: text above the figure.
 
     Raises:
         InputError: fewer than one mode, or deviations that are not positive.
@@ -293,7 +293,7 @@ def quality_figure(quality: Quality | Mapping[str, object], *, title: str = "") 
     """
     if not isinstance(quality, Quality):
         try:
-            quality = read(Quality, quality, "What was measured of a model", "give lists of numbers")
+            quality = read(Quality, quality, "The quality of a model", "give lists of numbers")
         except FileFormatError as error:
             raise InputError(str(error)) from error
     qualities = [quality, *quality.others]

@@ -55,7 +55,7 @@ def distributions_figure(values: Mapping[str, FloatArray], trusted: Any, *, titl
     Args:
         values: (n,) values of each measure, by its name in words; values that are not finite are omitted.
         trusted: (n,) whether each fit is trusted.
-        title: above the figure.
+        title: text above the figure.
 
     Raises:
         InputError: there is nothing to draw.
@@ -140,9 +140,9 @@ def density_figure(z: npt.NDArray[np.floating[Any]], distances: FloatArray, *, t
     """Draw the density of fits in the first coefficients, and of their distance from the mean.
 
     Args:
-        z: (n, K) in standard deviations.
-        distances: (n,) their root mean square.
-        title: above the figure.
+        z: (n, K) coefficients of the fits, in standard deviations.
+        distances: (n,) root mean square of the coefficients of each fit.
+        title: title of the figure.
 
     Raises:
         InputError: fewer than two coefficients.
@@ -190,7 +190,7 @@ def over_time_figure(
         untrusted: (n,) whether a fit is not trusted.
         is_time: whether `times` are times.
         name: name of the time or number.
-        title: above the figure.
+        title: text above the figure.
         lines: name and (n,) membership of each group of fits with a line of its own in the first plot.
 
     Raises:
@@ -264,7 +264,7 @@ def levels_figure(groups: Sequence[tuple[str, Any]], values: FloatArray, *, word
         groups: name and (n,) membership of each group.
         values: (n,) values of the measure.
         words: name and unit of the measure.
-        title: above the figure.
+        title: text above the figure.
 
     Raises:
         InputError: there is nothing to draw.
@@ -317,7 +317,7 @@ def scatter_matrix(points: Sequence[Coefficients], modes: int = 4, *, title: str
     Args:
         points: the scans.
         modes: how many coefficients at most.
-        title: above the figure.
+        title: text above the figure.
 
     Raises:
         InputError: no scans, or scans with different numbers of coefficients.
@@ -379,7 +379,7 @@ def b_plane(
 
     Args:
         scans: scans of expressions.
-        title: above the figure.
+        title: text above the figure.
         neutral: the neutral face, through which a line is drawn for each expression; None draws no lines.
 
     Raises:
@@ -519,7 +519,7 @@ def _wider_than_three(axis: Any) -> float:
 def _stack_coefficients(scans: Sequence[Coefficients]) -> FloatArray:
     """Return the coefficients of all scans, (n, K) mm."""
     if not scans:
-        raise InputError("There is nothing to draw of coefficients without scans.")
+        raise InputError("There are no scans, so there are no coefficients to draw.")
     if len({scan.b.shape for scan in scans}) > 1:
         raise InputError("The scans have different numbers of coefficients, so they were fitted by different models.")
     return np.stack([scan.b for scan in scans])

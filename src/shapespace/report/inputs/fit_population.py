@@ -330,8 +330,8 @@ def _code(status: str) -> int:
 
 
 def _encode_texts(texts: Sequence[str | None], codes: dict[str, int], max_levels: int) -> npt.NDArray[np.int32]:
-    """Return the index of each text in `codes`, which grows; -1 for missing ones and beyond `max_levels` distinct
-    texts.
+    """Return the index of each text in `codes`, which grows; -1 for missing texts, and for
+    texts beyond `max_levels` distinct texts.
     """
     out = np.full(len(texts), -1, dtype=np.int32)
     for k, text in enumerate(texts):

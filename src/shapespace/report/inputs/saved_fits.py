@@ -53,7 +53,7 @@ class Folder:
 
     Args:
         root: the folder.
-        again: what a reader can do about a file that is wrong.
+        again: remedy for a damaged file, for messages.
     """
 
     root: Path
@@ -66,7 +66,7 @@ class Folder:
             FileFormatError: it is no name, or it leads out of the folder.
         """
         if not isinstance(name, str) or not name:
-            raise FileFormatError(f"A result file has no name where one is needed; {self.again}.")
+            raise FileFormatError(f"A result file lacks the name of a file; {self.again}.")
         try:
             path = self.root / name
             inside = path.resolve().is_relative_to(self.root.resolve())
@@ -241,7 +241,7 @@ def _results(folder: Folder) -> Results:
 
 
 def saved_fit(folder: Folder, results: Results, name: str) -> SavedFit:
-    """Return one fit of `results`, which belong to `folder`; `unreadable` if it cannot be read."""
+    """Return the fit `name` of `results`, which belong to `folder`; its status is `unreadable` if it cannot be read."""
     fitted, dense, stages = (
         f"{name}{ENDINGS[kind]}" if results.has(name, kind) else None for kind in ("fitted", "dense", "stages")
     )

@@ -238,9 +238,9 @@ class CorrespondencePage:
         if not moved:
             return ""
         if moved[-1] < self.result.settled:
-            return f"The rounds have settled: in the last one vertices moved by {percent_of(moved[-1])} of the size."
+            return f"The rounds have settled: in the last round vertices moved by {percent_of(moved[-1])} of the size."
         return (
-            f"The rounds have not settled: in the last one vertices still moved by {percent_of(moved[-1])} of the "
+            f"The rounds have not settled: in the last round vertices still moved by {percent_of(moved[-1])} of the "
             f"size, and {percent_of(self.result.settled)} counts as settled; more --rounds may still improve it."
         )
 
@@ -363,7 +363,7 @@ class CorrespondencePage:
     # The scans
 
     def scans(self) -> list[Block]:
-        """Return the gallery, the worst first, and the table of all."""
+        """Return the gallery of scans, the worst first, and the table of all scans."""
         return [
             self.page.section(
                 (

@@ -181,7 +181,7 @@ class FolderPage:
         return self._cards | self._details
 
     def place_of(self, name: str) -> str | None:
-        """Return the place in the page of a fit, or None."""
+        """Return the place of the fit `name` in the page; None if the page does not show it."""
         return (self._details | self._cards).get(printable(name))
 
     def model_part(self) -> list[Block]:
@@ -385,7 +385,7 @@ class FolderPage:
                             f"+{limit:g} mm, scan outside",
                         )
                     ],
-                    "Grey is what the scan does not show. Distances to a scan of points only have no sign: their map "
+                    "Grey parts are not shown by the scan. Distances to a scan of points only have no sign: their map "
                     f"runs from 0 to {limit:g} mm.",
                 )
             )

@@ -39,7 +39,7 @@ Make: TypeAlias = Callable[[], Block | Sequence[Block]]
 
 @dataclass(frozen=True)
 class Chapter:
-    """A part of the page that its navigation leads to: its heading, what makes it, and its link's text if shorter."""
+    """A part of the page in its navigation: its heading, the function that makes it, and a shorter text of its link."""
 
     heading: str
     make: Make

@@ -107,7 +107,7 @@ class IdentificationResult(AnalysisResult):
         scores: rates of each requested score, in that order.
         enrolled: number of people in the gallery; the smallest of all rounds.
         probes: number of searches.
-        trained_on: number of training people; the smallest of all rounds.
+        trained_on: number of training people, the smallest of all rounds of the cross-validation.
         trial: roles of the scans.
         config: options of the analysis.
 

@@ -47,7 +47,7 @@ class Samples:
         n = len(self.subjects)
         arrays = (self.x, self.variance, self.mm)
         if self.x.shape != self.variance.shape or any(a.ndim != 2 or len(a) != n for a in arrays):
-            raise InputError("Samples need a row of coefficients, variances and a shape for each subject.")
+            raise InputError("Samples need one row of coefficients, of variances and of the shape for each scan.")
         if not all(np.isfinite(a).all() for a in arrays) or (self.variance < 0).any():
             raise InputError("Samples need finite coefficients, and variances that are not negative.")
 

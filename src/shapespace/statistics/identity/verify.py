@@ -88,7 +88,7 @@ class VerificationResult(AnalysisResult):
         scores: rates of each requested score, in that order.
         pairs: compared pairs of scans.
         people: names of the people.
-        trained_on: number of training people; the smallest of all rounds.
+        trained_on: number of training people, the smallest of all rounds of the cross-validation.
         trial: roles of the scans.
         config: options of the analysis.
 
@@ -283,15 +283,16 @@ def cllr_min(score: FloatArray, same: BoolArray) -> float:
 
 
 def calibrated(score: FloatArray, pairs: Pairs, group: IntArray) -> FloatArray | None:
-    """Return the log likelihood ratio (M,), natural, of each score, by a logistic regression on other people.
+    """Return the natural log likelihood ratio (M,) of each score, by a logistic regression on pairs of other people.
 
     Args:
         score: (M,) scores.
         pairs: compared pairs.
-        group: (P,) group of each person; a pair is calibrated by pairs of people of neither's group.
+        group: (P,) group of each person. The score of a pair is calibrated by the pairs without a person of the groups
+            of both its people.
 
     Returns:
-        None if some groups leave no pairs of both kinds for calibration.
+        None if the pairs that calibrate a score are all of the same person, or all of different people.
 
     Raises:
         ShapespaceError: scikit-learn is not installed.

@@ -221,7 +221,11 @@ def _modules(cohort: Cohort, path: Path) -> tuple[Cohort, dict[str, list[int]]]:
     flat = sorted(point for own in points.values() for point in own)
     unknown = [cell for cell, module in rows if cell not in numbers or not module]
     if unknown or len(set(flat)) < len(flat):
-        problem = f"{unknown[0][:40]!r} is not in the shapes or has no module" if unknown else "one is listed twice"
+        problem = (
+            f"{unknown[0][:40]!r} is not in the shapes or has no module"
+            if unknown
+            else f"a {header[0]} is listed twice"
+        )
         raise InputError(f"{path}: list each {header[0]} of the shapes once, with its module; {problem}.")
     if len(points) < 2 or min(map(len, points.values())) < 2 or len(cohort) < 3:
         raise InputError(f"{path}: covariation needs 3 shapes or more, and two modules of two {noun} or more each.")

@@ -353,7 +353,7 @@ class _MeanDistance:
         """Return the (B,) squared distances less that of a limit by their standard error, the observed value first.
 
         In the bootstrap samples the means differ by the limit, which is `relative` to the estimated variance or not. An
-        observed distance below the distance by sampling alone counts as the latter, since no sample shows smaller ones.
+        observed distance below the distance by sampling alone is replaced by it, since no sample shows a smaller one.
         """
         # M25
         scale = limit / self.length
@@ -502,7 +502,9 @@ def discriminate(
 
 
 def _within_products(means: FloatArray, shape: FloatArray, counts: Orders) -> FloatArray:
-    """Return the products (b, G, G + 1) of group means with each other and a shape, by the scatter within.
+    """Return the inner products (b, G, G + 1) of the group means with each other, and last with a shape.
+
+    The metric is the inverse of the scatter within groups.
 
     Args:
         means: (b, G, q) means of the groups, in coordinates with a mean of 0 and the identity as total scatter.

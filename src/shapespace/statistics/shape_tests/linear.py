@@ -85,7 +85,7 @@ def compare_trajectories(
     stages = order or tuple(sorted(set(texts), key=float if cohort.table.kind(points) == "number" else str))
     if set(stages) != set(texts) or len(stages) < 2 or len(set(stages)) < len(stages):
         raise InputError(
-            f"{cohort.table.where}: a trajectory needs two or more different points, each class of {points!r} once, "
+            f"{cohort.table.where}: a trajectory needs two or more points: each class of {points!r} exactly once, "
             f"not {', '.join(stages)[:80]}."
         )
     g, p = len(groups.names), len(stages)
@@ -510,7 +510,7 @@ def _models(cohort: Cohort, formula: str, null: str | None) -> tuple[Design, Flo
 
 
 def _mean_estimator(design: Design, indicator: FloatArray) -> FloatArray:
-    """Return the (G, N) estimator of least-squares means of groups (N, G), with numbers at their mean (M30)."""
+    """Return the (G, N) estimator of least-squares means of groups, with numeric covariates at their mean (M30)."""
     n = len(indicator)
     values = {v.column: design.values[v.column] if v.levels else [v.middle] * n for v in design.variables}
     rows = indicator.T @ _with_constant(design.rows(values)) / indicator.sum(axis=0)[:, None]

@@ -120,8 +120,8 @@ def ordinate(
             phylogenetically aligned components.
         group: columns whose classes, or combinations of classes, are the groups.
         tree: phylogeny (Newick or Nexus) whose tips are the shapes; drawn into the plot of principal components.
-        components: number of principal components that cva uses (default: all, or, if these are too many for the
-            shapes, those of 95 % of the variance, at most half of the shapes minus the groups).
+        components: number of principal components that cva uses. Default: all; if these are too many for the number of
+            shapes, those of 95 % of the variance, but at most half of (number of shapes - number of groups).
         drop_missing: exclude shapes with missing values in the table (default: an error).
 
     Raises:

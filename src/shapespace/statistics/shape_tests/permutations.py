@@ -101,7 +101,10 @@ class Groups:
         return (values - means_of(values, self.codes)[self.codes]) * np.sqrt(counts / (counts - 1))
 
     def resamples(self, draws: int, seed: int) -> FloatArray:
-        """Return how often each shape is drawn (draws, N) in bootstrap samples of each group; first, each once."""
+        """Return how often each shape is drawn (draws, N) in bootstrap samples within each group.
+
+        The first sample contains each shape once.
+        """
         rng = np.random.default_rng([seed, _STREAM, _RESAMPLES])
         counts = np.ones((draws, len(self.codes)))
         for g, n in enumerate(self.counts.tolist()):
@@ -137,6 +140,6 @@ class Groups:
             raise InputError(
                 f"{cohort.table.where}: the group {names[small]!r} of {label} has {groups.counts[small]} "
                 f"shape{'s' if groups.counts[small] > 1 else ''}, and "
-                f"{why or 'this test'} needs {least} or more; leave it out, or combine groups."
+                f"{why or 'this test'} needs {least} or more; exclude the group, or combine groups."
             )
         return groups

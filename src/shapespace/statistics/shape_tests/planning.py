@@ -50,7 +50,7 @@ def plan_sample_size(
             the root mean square over all pairs.
         sizes: numbers of shapes in each group.
         simulations: number of simulated studies for each size.
-        permutations: number of permutations in the test of each, including the simulated data.
+        permutations: number of permutations in the test of each simulated study, including its data as simulated.
         seed: seed of the simulations.
         drop_missing: exclude shapes with missing values in the table (default: an error).
         progress: function called with (done, total).
@@ -167,7 +167,7 @@ def _simulator(
 
 
 def _smallest_size(sizes: tuple[float, ...], powers: tuple[float, ...]) -> int | None:
-    """Return the size for the planned power; None if it is outside the sizes."""
+    """Return the smallest sample size with the planned power; None if it is not within the range of `sizes`."""
     if not powers[0] < _POWER <= max(powers):
         return None
     # The probit of the power is nearly linear in the root of the size.

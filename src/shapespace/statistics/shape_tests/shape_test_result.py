@@ -28,8 +28,8 @@ class Statistic:
         tested: compared groups or variables, such as `female – male`; empty if the name states them.
         value: observed value.
         p: share of the arrangements that are as extreme; None without a test, or if it is not known.
-        z: effect size, the value in standard deviations of its arrangements; None without.
-        low, high: confidence interval; None without.
+        z: effect size, the value in standard deviations of its arrangements; None if it is not computed.
+        low, high: confidence interval; None if none is computed.
         arrangements: (P,) the statistic of each arrangement, the observed one first; empty without a test.
         unknown_p: reason why p is not known; None if it is known, or without a test.
 

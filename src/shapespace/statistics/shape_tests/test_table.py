@@ -1,4 +1,4 @@
-"""Table of the tests of shape: what each computes, what it permutes, its source, and the options of its command.
+"""Table of the tests of shape: for each its statistics, permuted unit, source, and the options of its command.
 
 The command line imports this module for its help, so it imports nothing that takes time.
 """
