@@ -161,7 +161,7 @@ def test_what_the_model_left_and_what_the_modes_cannot_make_are_said_to_be_outsi
     assert methods.dimensions == 2 and methods.analysed_variance_ratio == found.variance_share
     assert [one.resampling for one in methods.tests] == ["leave-one-out", "none"]
     summary = analysis_report(found).summary
-    assert sum("outside the reference or the model: " in sentence for sentence in summary) == 3
+    assert sum("Its score may not describe its shape: " in sentence for sentence in summary) == 3
 
 
 def test_repeated_scans_of_a_person_count_once_and_leave_together() -> None:

@@ -96,7 +96,8 @@ class ScoreResult(AnalysisResult):
             subject's vertex is an estimate without samples.
         z_limit: |z| below which 95 % of the reference's people stay everywhere when held out; NaN for fewer than 19.
         nearest: nearest shapes of the reference, for each subject.
-        outside: sentences on how each subject lies outside the reference or the model; empty if it does not.
+        outside: reasons why the score of each subject may not describe its shape: its shape is outside the modes of the
+            reference or the model of its fit, or its fit is doubtful; empty if there are none.
         reference_distance: (N,) Mahalanobis distance of each shape of the reference from the others.
         reference_rest_mm: (N,) as `rest_mm`, for each shape of the reference.
         subjects: cohort of the scored subjects.
@@ -577,7 +578,7 @@ def _size_notes(people: int) -> list[str]:
 
 
 def _describe_outside(scores: ScoreResult, k: int) -> list[str]:
-    """Return sentences on how a subject lies outside the reference or the model."""
+    """Return the reasons why the score of a subject may not describe its shape."""
     out: list[str] = []
     # With a small reference, "beyond all of the reference" is the strongest possible statement.
     rare = max(_OUTSIDE, 1 / (scores.people + 1)) + 1e-9

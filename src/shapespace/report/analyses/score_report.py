@@ -77,7 +77,7 @@ def _sentence(result: ScoreResult, k: int) -> str:
         )
     if not result.outside[k]:
         return sentence
-    return f"{sentence} It is outside the reference or the model: {'; '.join(result.outside[k])}."
+    return f"{sentence} Its score may not describe its shape: {'; '.join(result.outside[k])}."
 
 
 def _method_sentences(result: ScoreResult) -> tuple[str, ...]:

@@ -183,7 +183,7 @@ class Project:
     def exclude(self, file: Path) -> None:
         """Exclude a scan that cannot be used, also in the states that an undo brings back.
 
-        This is no edit of the user's: those on the revision before remain possible.
+        This is no edit of the user's: the revision does not change, so that the user's next edit is accepted.
 
         Raises:
             FileError: it cannot be written.
@@ -303,7 +303,8 @@ class Project:
         return name, same
 
     def import_files(self, place: Path, role: Role, *, copy: bool) -> tuple[int, list[str]]:
-        """Add a scan or the scans of a folder on this machine; return their number, and sentences on the others.
+        """Add a scan or the scans of a folder on this machine; return the number of those added, and
+        sentences on the scans that are not.
 
         Raises:
             FileError: it cannot be read, or the copies not written.
