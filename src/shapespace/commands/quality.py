@@ -57,8 +57,8 @@ class QualityOptions:
     """Measures of quality, and the data that they refer to.
 
     Args:
-        representations: what the modes move, for all targets or one for each; two for one target compare it with
-            itself.
+        representations: quantities that the modes move, for all targets or one for each; two for one target compare
+            it with itself.
         scans: folder of the scans that the surfaces were made from, with the same names, pose and unit: distances are
             measured to these.
         unseen: folder of corresponding shapes that no model was trained on: also measure the error on these.
