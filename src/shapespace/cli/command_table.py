@@ -59,6 +59,7 @@ CONVERT = Source("commands.convert", "convert")
 _UNITS = ("um", "mm", "cm", "inch", "m")
 _ABOUT_MESHES = "kept in the model file (default: that in about.json next to the meshes)"
 _REPRESENTATIONS = ("vertices", "bspline", "bspline-detail")
+_FOR_FORMS: Mapping[str, Any] = {"commands": lambda: summaries_and_options()}
 _GOES_ON: Mapping[str, Any] = {"goes_on": "; the same command continues from there"}
 
 GROUPS: Mapping[str, str] = {
@@ -622,6 +623,7 @@ COMMANDS: tuple[CommandSpec, ...] = (
             "may run at the same time; nothing is written into it. The address that is printed contains a token, "
             "without which nothing is answered. Ctrl-C ends the viewer. Needs the extra view.",
         ),
+        defaults=_FOR_FORMS,
         json=False,
     ),
     CommandSpec(
@@ -642,7 +644,7 @@ COMMANDS: tuple[CommandSpec, ...] = (
             "view and report.",
         ),
         json=False,
-        defaults={"commands": lambda: summaries_and_options()},
+        defaults=_FOR_FORMS,
     ),
     CommandSpec(
         "landmarks transfer", "transfer landmarks from a few marked specimens to all scans in correspondence",

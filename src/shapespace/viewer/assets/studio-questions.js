@@ -44,7 +44,7 @@
         <div class="row bar"><h2>${Q.title}</h2><span class="grow"></span>
           ${earlier.some((job) => job.status === "done") && html`<${Button} strong testid="next" onclick=${next}>${T.next.questions}<//>`}</div>
         <ul class="questions">
-          ${KINDS.filter((one) => Studio.forms[one]).map((one) => html`<li key=${one}><button type="button" data-testid=${`question-${one}`} onclick=${() => setQuestion({ kind: one })}><strong>${Studio.action(one)}</strong><span class="hint">${Q.hints[one]}</span></button></li>`)}
+          ${KINDS.filter((one) => Studio.forms[one] && !Studio.state.read_only).map((one) => html`<li key=${one}><button type="button" data-testid=${`question-${one}`} onclick=${() => setQuestion({ kind: one })}><strong>${Studio.action(one)}</strong><span class="hint">${Q.hints[one]}</span></button></li>`)}
         </ul>
         ${earlier.length > 0 && html`<h3>${Q.earlier}</h3>
           <ul class="recent">${earlier.map((job) => html`<li key=${job.number}><button type="button" data-testid=${`earlier-${job.number}`} onclick=${() => setQuestion({ kind: job.kind, first: job.number })}>

@@ -51,7 +51,7 @@
           <${Button} edits strong testid="write-report" disabled=${!source || busy} onclick=${() => Studio.runJob("report", {}, source.number)}>${T.export.report}<//></div>
         <${Jobs} kinds=${["report", "convert", "export", "figures"]} />
         ${Studio.jobsOf(Studio.QUESTIONS).filter(Studio.isActive).map((job) => html`<${JobPanel} key=${job.number} job=${job} />`)}
-        ${Studio.newest("build") && Studio.forms.convert && html`<details class="narrow" data-testid="convert"><summary>${T.export.convert}</summary><${JobForm} kind="convert" sources=${["build"]} /></details>`}
+        ${Studio.newest("build") && Studio.forms.convert && !Studio.state.read_only && html`<details class="narrow" data-testid="convert"><summary>${T.export.convert}</summary><${JobForm} kind="convert" sources=${["build"]} /></details>`}
         ${!done.length ? html`<p class="hint">${T.export.none}</p>` : html`
           <div class="table-box" role="region" aria-label=${T.export.title} tabindex="0"><table class="plain">
             <thead><tr><th scope="col">${T.export.result}</th><th scope="col">${T.export.files}</th><th scope="col">${T.export.actions}</th></tr></thead>

@@ -21,7 +21,7 @@ QUESTIONS = ("compare", "change", "asymmetry", "regress", "score", "identify", "
 CORRESPONDENCES = ("correspond", "redo")
 _INPUTS = "inputs"
 _TERMINAL_NOTES = re.compile(
-    r" \([^()]*(?:\.npz|\.json|NAME\.|MODEL\.h5)[^()]*\)|; exit with \d [^.;]*|(?m:^(?:next|usage): .*\n?)"
+    r" \([^()]*(?:NAME\.|MODEL\.h5|about\.json)[^()]*\)|; exit with \d [^.;]*|(?m:^(?:next|usage): .*\n?)"
 )
 """Parts for the terminal alone: names of result files in parentheses, exit codes, usage, and the next command."""
 _ERROR = re.compile(r"shapespace [a-z ]+: error: (?:argument (?:-\w/)?(?:(--set|--[\w-]+(?=: must)):)?)?")
@@ -45,7 +45,7 @@ class OptionLabels:
     def __init__(self, forms: Forms) -> None:
         self._options = {option["flag"]: option for form in forms.values() for option in form["options"]}
         self._actions = {" ".join(form["command"]): form["label"] for form in forms.values()}
-        names = "|".join(sorted(self._actions, key=len, reverse=True))
+        names = "|".join(sorted(self._actions, key=len, reverse=True)) or "(?!)"
         self._action = re.compile(rf"(?:\bshapespace ({names})\b(?! \S+ -\w\b)|\b({names})(?= --))( (?=--))?")
 
         self.forms = {
