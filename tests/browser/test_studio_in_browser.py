@@ -233,6 +233,7 @@ def test_raw_scans_become_a_report_by_clicks_and_history_gives_the_same_numbers(
             User(seen).sees("sentences")
             framed(seen)
             seen.shot("read-only")
+            assert seen.page.locator("[data-testid^=outdated]").count() == 0
             assert seen.page.get_by_test_id("form-compare").count() == 0
             assert barriers(seen) == [] and seen.complaints == []
     again = tmp_path / "again"

@@ -6,6 +6,7 @@ from typing import Any
 import httpx
 import pytest
 from test_studio_server import ended, own_home, state, studio, until
+from test_studio_words import TERMINAL, in_words
 
 from shapespace.cli import main
 from shapespace.viewer.studio.job_commands import QUESTIONS
@@ -26,9 +27,12 @@ def run(client: httpx.Client, kind: str, options: dict[str, Any] | None = None, 
     assert job["status"] == "done", (kind, log)
     files = client.get(f"/api/jobs/{number}/files").json()
     assert files, (kind, log)
+    for text in (log, job["message"], *job["sentences"], job["methods"] or ""):
+        assert TERMINAL.search(text) is None, (kind, text)
     for view in job["views"]:
         shown = client.get(view["href"])
         assert shown.status_code == 200 and b"<html" in shown.content, (kind, view)
+        assert TERMINAL.search(in_words(shown.text)) is None, (kind, TERMINAL.search(in_words(shown.text)))
     return job
 
 

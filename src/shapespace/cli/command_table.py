@@ -57,8 +57,9 @@ EXPORT_COHORT = Source("commands.export", "export_cohort")
 CONVERT = Source("commands.convert", "convert")
 
 _UNITS = ("um", "mm", "cm", "inch", "m")
-_ABOUT_MESHES = "kept in the model file (default: from about.json next to the meshes)"
+_ABOUT_MESHES = "kept in the model file (default: that in about.json next to the meshes)"
 _REPRESENTATIONS = ("vertices", "bspline", "bspline-detail")
+_FOR_FORMS: Mapping[str, Any] = {"commands": lambda: summaries_and_options()}
 _GOES_ON: Mapping[str, Any] = {"goes_on": "; the same command continues from there"}
 
 GROUPS: Mapping[str, str] = {
@@ -441,7 +442,8 @@ COMMANDS: tuple[CommandSpec, ...] = (
             advanced("--recursive", source=BUILD_FILES),
             advanced("--with-doubtful", source=BUILD_FILES),
             advanced("--no-align", help="use the meshes in their pose, without alignment", source=BUILD),
-            advanced("--region", "NAME=FILE", "region of the surface for fit --region: a CSV file of vertices; can be "
+            advanced("--region", "NAME=FILE", "region of the surface, to which fits can be restricted: a CSV "
+                     "file of vertices; can be "
                      "repeated", parse=values.named_file, repeat=True),
             advanced("--min-seen", "SHARE", source=BUILD_FILES, parse=values.share),
             advanced("--representation", source=BUILD, choices=_REPRESENTATIONS),
@@ -526,9 +528,9 @@ COMMANDS: tuple[CommandSpec, ...] = (
             basic("--region",
                   "NAME|FILE.csv", "restrict the fit, its distances and its status to a region of the model: "
                   "its name, or a CSV file of vertices"),
-            basic("--dense", help="also write NAME.dense.ply, the fitted surface deformed further onto the scan",
+            basic("--dense", help="also write the fitted surface deformed further onto the scan (NAME.dense.ply)",
                   source=FIT),
-            basic("--stages", help="also write NAME.stages.npz, for figures"),
+            basic("--stages", help="also write the stages of the fit, for figures (NAME.stages.npz)"),
             advanced("--recursive", help="also search subfolders of the given folders"),
             advanced("--method",
                      "NAME", "robust: pose and shape jointly, from distances in both directions; paper: the "
@@ -538,7 +540,7 @@ COMMANDS: tuple[CommandSpec, ...] = (
             advanced("--again", help="fit all scans again, also those with valid results", either="results"),
             advanced("--store",
                      help="write the results to few files (the default from 10,000 scans on, and in a folder "
-                     "with such files); then only counts are printed"),
+                     "with such files); then only counts are reported"),
             advanced("--strict", help=f"{_STRICT_HELP}; exit with 1 when a fit is doubtful", source=FIT),
         ),
         (
@@ -552,8 +554,8 @@ COMMANDS: tuple[CommandSpec, ...] = (
         settings=(
             _LANDMARK_STDDEV,
             setting("search", source=PAPER, choices=("auto", "vertices", "surface"), default="auto",
-                    help="closest points of --method paper: vertices of the scan (auto), as in the paper, or points "
-                    "on its triangles; the robust method always uses the triangles"),
+                    help="closest points of the paper's method: vertices of the scan (auto), as in the paper, or "
+                    "points on its triangles; the robust method always uses the triangles"),
             setting("max_iterations", "N", source=FIT, parse=values.positive),
             *_EXECUTION_SETTINGS,
             setting("seed", "S", source=FIT),
@@ -626,6 +628,7 @@ COMMANDS: tuple[CommandSpec, ...] = (
             "may run at the same time; nothing is written into it. The address that is printed contains a token, "
             "without which nothing is answered. Ctrl-C ends the viewer. Needs the extra view.",
         ),
+        defaults=_FOR_FORMS,
         json=False,
     ),
     CommandSpec(
@@ -646,7 +649,7 @@ COMMANDS: tuple[CommandSpec, ...] = (
             "view and report.",
         ),
         json=False,
-        defaults={"commands": lambda: summaries_and_options()},
+        defaults=_FOR_FORMS,
     ),
     CommandSpec(
         "landmarks transfer", "transfer landmarks from a few marked specimens to all scans in correspondence",
@@ -978,19 +981,19 @@ COMMANDS: tuple[CommandSpec, ...] = (
             basic("--along", "COLUMN", source=ALONG, either=_TARGET, required=True),
             basic("--at", "VALUES", source=ALONG, parse=values.numbers),
             advanced("--covariates", "TERMS", source=ALONG),
-            advanced("--length", "A,B", "of --along: two landmarks whose distance is predicted too; can be repeated",
+            advanced("--length", "A,B", "with --along: two landmarks whose distance is predicted too; can be repeated",
                      source=ALONG, field="lengths", parse=values.words, repeat=True, default=[]),
             basic("--predict", "NEW", "also predict new shapes, of other subjects: a table, a folder or a cohort file",
                   parse=Path),
-            advanced("--permutations", "P", "permutations for p, 0 for none (default: 199; with --along 1000)",
+            advanced("--permutations", "P", "permutations for p, 0 for none (default: 199, or 1000 with --along)",
                      parse=values.integer),
         ),
         settings=_question_settings(
             setting("curve", source=ALONG, default=None),
-            setting("hold", "COLUMN=VALUE", "of --along: value of another column, such as sex=female; separate several "
-                    "by commas (default: numbers at their mean, and classes count alike)", parse=values.words),
+            setting("hold", "COLUMN=VALUE", "with --along: value of another column, such as sex=female; separate "
+                    "several by commas (default: numbers at their mean, and classes count alike)", parse=values.words),
             setting("folds", "K", source=REGRESS, parse=values.integer),
-            setting("level", "L", "coverage of intervals (default: 0.9; with --along 0.95)", dest="confidence",
+            setting("level", "L", "coverage of intervals (default: 0.9, or 0.95 with --along)", dest="confidence",
                     parse=values.number),
             setting("seed", "S", source=REGRESS, parse=values.integer),
         ),
@@ -1039,7 +1042,8 @@ COMMANDS: tuple[CommandSpec, ...] = (
             basic("source", "IN", "a model in any format that can be read", parse=Path),
             basic("output", "OUT", "its extension sets the format; .h5 is the format of shapespace", parse=Path),
             basic("--to", "FORMAT", source=CONVERT),
-            basic("--unit", "UNIT", "unit of IN, if its format does not contain it (default: mm)", choices=_UNITS),
+            basic("--unit", "UNIT", "unit of the model, if its format does not contain it (default: mm)",
+                  choices=_UNITS),
             advanced("--expressions", "FILE.bin", source=CONVERT),
         ),
         ("Prints the parts that were kept, changed and omitted. Training shapes are always omitted.",),

@@ -314,7 +314,8 @@ def _read_texts(docstring: str) -> dict[str, str]:
     """Return the texts of a docstring's section Args by name."""
     section = re.search(r"^Args:\n(.*?)(?=^\S|\Z)", docstring, re.MULTILINE | re.DOTALL)
     entries = re.findall(r"^    (\w+): (.*?)(?=^    \w|\Z)", section[1] if section else "", re.MULTILINE | re.DOTALL)
-    return {name: " ".join(text.split()).removesuffix(".") for name, text in entries}
+    lines = {name: " ".join(text.split()).removesuffix(".") for name, text in entries}
+    return {name: re.sub(r" \(in Python [^()]*\)", "", line) for name, line in lines.items()}
 
 
 def _evaluate_literal(node: ast.expr | None) -> Any:

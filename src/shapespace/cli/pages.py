@@ -13,7 +13,10 @@ from shapespace.viewer.serve import serve, serve_studio
 def view(arguments: argparse.Namespace) -> int:
     """Show a model, fits, or surfaces in correspondence in the browser."""
     options = given(arguments, serve)
-    serve(arguments.path, **options, open_browser=not arguments.no_open, quiet=arguments.quiet, say=now)
+    serve(
+        arguments.path, **options, open_browser=not arguments.no_open, quiet=arguments.quiet,
+        forms=lambda: forms(arguments.commands()), say=now,
+    )  # fmt: skip
     return 0
 
 

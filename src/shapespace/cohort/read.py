@@ -66,12 +66,12 @@ class CohortConfig:
             `doubtful`).
         geometry: analysed part of surfaces with landmarks: the `surface`, or the `landmarks` alone.
         least: smallest number of shapes; a single shape suffices if it is compared with an existing cohort.
-        imputations: number of samples of each completed shape (NAME.samples.npz next to NAME.ply) that compare,
-            regress, asymmetry and score combine by Rubin's rules; 0 or 1 ignores samples.
+        imputations: number of samples of each completed shape (NAME.samples.npz next to NAME.ply) that
+            comparisons, regression, asymmetry and scores combine by Rubin's rules; 0 or 1 ignores samples.
         unit: unit of the lengths; `none` for coordinates without a unit, as those of digitised landmarks.
         missing: treatment of shapes with missing values in the table: `drop` excludes them (default: an error).
         subject: column of the subjects (default: subject).
-        landmarks: CSV of name,vertex, or landmarks.csv of correspond (default: those of the model or the folder).
+        landmarks: CSV of name,vertex, or landmarks.csv of a correspondence (default: those of the model or the folder).
         orientation: JSON file with named views of the object, such as dorsal, and links between landmarks (default:
             orientation.json and links.csv next to the shapes).
     """

@@ -66,8 +66,8 @@ class BuildFilesConfig:
             the number of modes then counts modes of identity (`auto`: 0.995 of the variance).
         expression_variance: share of the expression variance that the expression modes explain, for a model of identity
             and expression (default 0.99).
-        keep_shapes: keep the aligned shapes as MODEL.h5.shapes, so that meshes can be added later (4 bytes per
-            coordinate of a mesh).
+        keep_shapes: keep the aligned shapes next to the model (MODEL.h5.shapes), so that meshes can be added later, 4
+            bytes per coordinate of a mesh.
         add: add the meshes to this model, which was built with its shapes kept; gauge, alignment and landmarks are
             those of that model.
         recursive: also search subfolders of the given folders.

@@ -28,7 +28,7 @@ class CompletionFiles:
     Args:
         landmarks: landmarks of the one scan, or a folder with a file for each scan, named after it.
         recursive: also search subfolders of the given folders.
-        stl: also write NAME.stl with four times the triangles, for CAD; closed where the model is.
+        stl: also write the surface with four times the triangles, closed where the model is, for CAD (NAME.stl).
     """
 
     landmarks: Path | None = None

@@ -192,7 +192,7 @@ def export_cohort(cohort: Cohort, output: Path, to: Target, formula: str | None 
     Args:
         cohort: cohort with coordinates as they are compared: aligned, and in the tangent space in the gauge shape.
         output: the file; a folder for geomorph, or to write landmarks.ENDING into.
-        to: geomorph (a folder with a script in R), morphoj, tps or csv (default: fits of DATA as files)
+        to: geomorph (a folder with a script in R), morphoj, tps or csv (default: fits as files)
         formula: linear model of shape for geomorph, such as '~ sex + age' (default: the mean alone)
 
     Raises:

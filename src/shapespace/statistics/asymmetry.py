@@ -252,8 +252,8 @@ def measure_asymmetry(
             if the table has it; otherwise each shape is of another subject).
         pairs: pairs of vertices that mirror each other, a vertex on the plane with itself (default: found on the mean).
         where: name of the pairs in messages.
-        side: column of the sides if they are separate shapes, such as left and right wings (matching symmetry); None
-            for symmetric objects.
+        side: column of the sides if they are separate shapes, such as left and right wings, for matching symmetry
+            (default: symmetric objects).
         reference: column and value of the subjects that scores are compared with; None for all.
         degrees_of_freedom: kind of the degrees of freedom of the ANOVA: those of the subjects times the dimensions of
             the shapes (`klingenberg`), or those of the `observations` alone, as in geomorph.

@@ -36,8 +36,8 @@ class ChangeConfig:
         time: column of the times: numbers, dates (2026-05-31) or words (default: time, visit or date).
         order: order of times that are words, the earliest first, such as before,after.
         stable: part that did not change, by which visits are aligned: `auto` (detected), `all`, a region of the model,
-            a file of vertices, or `landmarks:NAME,NAME,MM`, the vertices within MM of these landmarks; in Python also
-            the vertices.
+            a file of vertices, or `landmarks:NAME,NAME,MM`, the vertices within MM of these landmarks (in Python also
+            the vertices).
         regions: name -> vertices, whose volumes are reported in addition to the total; None for the regions of the
             model.
         group: column of two groups whose changes are compared.

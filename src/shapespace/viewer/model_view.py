@@ -135,7 +135,8 @@ class ModelView:
 
         def sort_key(row: Mapping[str, Any]) -> tuple[int, float, str]:
             error = row["scan_to_model_mm"] if row["expected_error_mm"] is None else row["expected_error_mm"]
-            return _rank(row["status"]), -(error or 0.0), row["name"]
+            rank = _STATUS_ORDER.index(row["status"]) if row["status"] in _STATUS_ORDER else 0
+            return rank, -(error or 0.0), row["name"]
 
         return sorted(rows, key=sort_key)
 
@@ -202,7 +203,8 @@ class ModelView:
             pictured, why_not = False, "It was fitted by another model."
         elif not pictured and fit.status not in ("failed", "unreadable"):
             why_not = "Its fitted surface is not in the folder; fit the scan again."
-        row: dict[str, Any] = {
+        z = fit.record.z if self._is_of_this_model(fit) else ()
+        return {
             "name": fit.name,
             "label": fit.label,
             "status": fit.status,
@@ -210,17 +212,12 @@ class ModelView:
             "pictured": pictured,
             "why_not": why_not,
             "fitted": fit.entry.fitted is not None and fit.fitted,
-            "z": None,
-        }
-        row |= {
+            "z": [float(f"{value:.{_DIGITS}g}") for value in z] or None,
             "shown": to_json(fit.record.shown),
             "model_to_scan_mm": _number(fit.summary_mm("final", "model_to_scan", "mean")),
             "scan_to_model_mm": _number(fit.summary_mm("final", "scan_to_model", "mean")),
             "expected_error_mm": _number(fit.expected_error_mm),
         }
-        if self._is_of_this_model(fit) and fit.record.z:
-            row["z"] = [float(f"{value:.{_DIGITS}g}") for value in fit.record.z]
-        return row
 
 
 @contextmanager
@@ -266,10 +263,6 @@ def _reason_with_name(fit: SavedFit) -> str:
         return fit.reason
     path = re.compile(rf"(?<![\w.~/\\])(?:[A-Za-z]:)?[\\/][^\n]*?[\\/]{re.escape(name)}")
     return path.sub(lambda _: name, fit.reason)
-
-
-def _rank(status: str) -> int:
-    return _STATUS_ORDER.index(status) if status in _STATUS_ORDER else 0
 
 
 def _number(value: float) -> float | None:

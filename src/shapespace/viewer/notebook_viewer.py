@@ -44,8 +44,7 @@ class NotebookView:
         resources: ExitStack,
     ) -> None:
         self._server, self._thread, self._access, self._resources = server, thread, access, resources
-        self.port = port
-        self.height_px = height_px
+        self.port, self.height_px = port, height_px
 
     @property
     def address(self) -> str:

@@ -53,6 +53,7 @@ def serve(
     open_browser: bool = True,
     max_upload_mb: int = 200,
     quiet: bool = False,
+    forms: Callable[[], Mapping[str, Mapping[str, Any]]] = dict,
     say: Callable[[str], None] = print,
 ) -> None:
     """Show a model, the fits of a folder, surfaces in correspondence, or a project in the browser until Ctrl-C.
@@ -65,6 +66,7 @@ def serve(
         open_browser: whether to open the page.
         max_upload_mb: size limit of a scan that is dropped onto the page, in MB.
         quiet: whether to hide the message about code that is being compiled.
+        forms: function that returns the forms of the commands, with whose labels a project is shown.
         say: called with the address, which contains the token.
 
     Raises:
@@ -79,7 +81,7 @@ def serve(
         raise InputError(f"{path} is {what} without fits; leave --model out.")
     if is_project:
         serve_studio(
-            path, {}, host=host, port=port, open_browser=open_browser, max_upload_mb=max_upload_mb, read_only=True,
+            path, forms(), host=host, port=port, open_browser=open_browser, max_upload_mb=max_upload_mb, read_only=True,
             say=say,
         )  # fmt: skip
         return

@@ -79,14 +79,14 @@ class _Endpoints:
     def routes(self) -> list[Route]:
         scan = "/api/scans/{key}"
         return [
-            Route("/", self.page),
+            route("/", lambda _: html_page("viewer")),
             Route("/assets/{name}", asset),
             Route("/api/about", self.about),
-            Route("/api/model", self.model),
-            Route("/api/fits", self.fits),
+            route("/api/model", lambda _: binary(self._view.packed_model())),
+            route("/api/fits", lambda _: json_response(self._view.fit_list())),
             Route("/api/fits/{name}", self.fit),
             Route("/api/export", self.export, methods=["POST"]),
-            Route("/api/scans", self.list_scans),
+            route("/api/scans", lambda _: json_response([scan.facts() for scan in self._scans.all()])),
             Route("/api/scans", self.upload, methods=["PUT"]),
             Route(scan, self.remove, methods=["DELETE"]),
             Route(f"{scan}/progress", self.progress),
@@ -98,9 +98,6 @@ class _Endpoints:
         ]
 
     # The model and the saved fits
-
-    def page(self, request: Request) -> Response:
-        return FileResponse(PAGES / "viewer.html", media_type="text/html")
 
     def about(self, request: Request) -> Response:
         model, limits = self._view.model, self._scans.limits
@@ -130,12 +127,6 @@ class _Endpoints:
                 "signal_colour": colours.BEYOND_COLOUR,
             }
         )
-
-    def model(self, request: Request) -> Response:
-        return binary(self._view.packed_model())
-
-    def fits(self, request: Request) -> Response:
-        return json_response(self._view.fit_list())
 
     def fit(self, request: Request) -> Response:
         try:
@@ -177,9 +168,6 @@ class _Endpoints:
         return shape_of(self._view.model, cast(list[float], z))
 
     # Uploaded scans
-
-    def list_scans(self, request: Request) -> Response:
-        return json_response([scan.facts() for scan in self._scans.all()])
 
     async def upload(self, request: Request) -> Response:
         name, limits = display_name(request.query_params.get("name", "")), self._scans.limits
@@ -336,24 +324,6 @@ def make_surfaces_app(
 def surfaces_app(surfaces: Surfaces) -> ASGIApp:
     """Return the application."""
 
-    def page(request: Request) -> Response:
-        return FileResponse(PAGES / "surfaces.html", media_type="text/html")
-
-    def about(request: Request) -> Response:
-        return json_response(surfaces.about())
-
-    def mean(request: Request) -> Response:
-        return binary(surfaces.packed_mean())
-
-    def population(request: Request) -> Response:
-        return binary(surfaces.packed_population())
-
-    def names(request: Request) -> Response:
-        return json_response(surfaces.names())
-
-    def surface_list(request: Request) -> Response:
-        return json_response(surfaces.rows())
-
     def of_scan(pack: Callable[[str], bytes]) -> Callable[[Request], Response]:
         def answer(request: Request) -> Response:
             try:
@@ -370,13 +340,13 @@ def surfaces_app(surfaces: Surfaces) -> ASGIApp:
         return binary(surfaces.positions_csv([int(part) for part in numbers]).encode(), "places.csv")
 
     routes = [
-        Route("/", page),
+        route("/", lambda _: html_page("surfaces")),
         Route("/assets/{name}", asset),
-        Route("/api/about", about),
-        Route("/api/mean", mean),
-        Route("/api/population", population),
-        Route("/api/names", names),
-        Route("/api/surfaces", surface_list),
+        route("/api/about", lambda _: json_response(surfaces.about())),
+        route("/api/mean", lambda _: binary(surfaces.packed_mean())),
+        route("/api/population", lambda _: binary(surfaces.packed_population())),
+        route("/api/names", lambda _: json_response(surfaces.names())),
+        route("/api/surfaces", lambda _: json_response(surfaces.rows())),
         Route("/api/surfaces/{name}", of_scan(surfaces.packed_surface)),
         Route("/api/faults/{name}", of_scan(surfaces.packed_faults)),
         Route("/api/places", positions),
@@ -421,6 +391,16 @@ def asset(request: Request) -> Response:
     return FileResponse(path, media_type=media_type)
 
 
+def route(path: str, answer: Callable[[Request], Response]) -> Route:
+    """Return the route of a path."""
+    return Route(path, answer)
+
+
+def html_page(name: str) -> Response:
+    """Return a page of the browser application."""
+    return FileResponse(PAGES / f"{name}.html", media_type="text/html")
+
+
 def json_response(content: object, status: int = 200) -> Response:
     """Return `content` as JSON; numbers that are not finite become null."""
     return JSONResponse(to_json(content), status)
@@ -439,18 +419,14 @@ def application(routes: Sequence[BaseRoute], public: Callable[[str], str]) -> St
         routes: routes of the application.
         public: function that removes the folders of this machine from an error message.
     """
-
-    async def input_error(_: Request, error: Exception) -> Response:
-        return refusal(422, public(str(error)))
-
     app = Starlette(
         routes=routes,
         exception_handlers={
             HTTPException: _http_error,
-            ShapespaceError: input_error,
-            ClientDisconnect: _disconnect_error,
+            ShapespaceError: lambda _, error: refusal(422, public(str(error))),
+            ClientDisconnect: lambda _, __: refusal(400, "The upload ended early."),
             OSError: _storage_error,
-            Exception: _internal_error,
+            Exception: lambda _, __: refusal(500, _INTERNAL_ERROR),
         },
     )
     # The redirect would repeat the Host header of the request.
@@ -463,14 +439,6 @@ async def _http_error(_: Request, error: Exception) -> Response:
     return refusal(error.status_code, _MESSAGES.get(error.detail, error.detail))
 
 
-async def _disconnect_error(_: Request, error: Exception) -> Response:
-    return refusal(400, "The upload ended early.")
-
-
 async def _storage_error(_: Request, error: Exception) -> Response:
     assert isinstance(error, OSError)
     return refusal(507, _STORAGE_ERROR.format(error.strerror or "its disk failed"))
-
-
-async def _internal_error(_: Request, error: Exception) -> Response:
-    return refusal(500, _INTERNAL_ERROR)

@@ -138,7 +138,7 @@ def read_hdf5(path: Path) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Attrib
             raise damaged
         raise FileFormatError(
             f"{path} is neither an HDF5 file nor a model of another tool; give a model that shapespace build wrote, or "
-            "a model in a format that shapespace convert --help names."
+            "a model in a format that shapespace convert reads."
         )
     if data[:_USER_BLOCK] != _user_block(memoryview(data)[_USER_BLOCK:]):
         raise damaged

@@ -176,7 +176,7 @@ def _limitation_notes(result: AsymmetryResult) -> Iterator[str]:
     if result.cohort.fitted is not None:
         yield (
             "Fits underestimate asymmetry if their model contains little asymmetry; docs/asymmetry.md states by how "
-            "much. Dense surfaces (--set surfaces=dense) of a model built with mirrored shapes underestimate it least."
+            "much. Dense surfaces (fit --dense) of a model built with mirrored shapes underestimate it least."
         )
 
 

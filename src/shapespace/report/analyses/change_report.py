@@ -537,7 +537,4 @@ def _notes(change: ChangeResult) -> Iterator[str]:
         pairs_of_visits = list_names([f"{first} to {last}" for first, last in sorted(ends)])
         yield f"Not all subjects have the same first and last visit ({pairs_of_visits})."
     if change.is_model_only:
-        yield (
-            "The surfaces are those of the model, so changes outside its span are missing; fit with --dense and pass "
-            "--set surfaces=dense."
-        )
+        yield ("The surfaces are those of the model, so changes outside its span are missing; fit with --dense.")

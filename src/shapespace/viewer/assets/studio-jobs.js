@@ -11,7 +11,8 @@
   const CHECK_AFTER = 400; // ms without a change of the form
 
   const duration = (seconds) => seconds < 90 ? J.seconds(Math.max(1, Math.round(seconds))) : seconds < 5400 ? J.minutes(Math.round(seconds / 60)) : J.hours((seconds / 3600).toFixed(1));
-  const kindOf = (job) => J.kinds[job.kind] || job.kind;
+  const action = (kind) => (Studio.forms[kind] ? Studio.forms[kind].label : J.kinds[kind] || kind);
+  const kindOf = (job) => action(job.kind);
 
   Studio.fileAddress = (path) => `/files/${path.split("/").map(encodeURIComponent).join("/")}`;
 
@@ -50,20 +51,18 @@
 
   function Option({ option, value, columns, onvalue }) {
     const { flag, kind, choices, initial, required } = option;
-    const words = flag.replace(/^--/, "").replace(/-/g, " ");
-    const name = words[0].toUpperCase() + words.slice(1);
-    const label = html`<span>${name}${required && html` <small>(${J.required})</small>`}</span>`;
+    const label = html`<span>${option.label}${required && html` <small>(${J.required})</small>`}</span>`;
     const common = { "data-testid": `option${flag}`, "aria-describedby": `help${flag}`, required };
     // The field shows the default already.
     const text = option.help.replace(/\s*\(default: [^()]*\)\s*$/, "");
     const help = html`<${Help} id=${`help${flag}`} text=${text} />`;
     if (kind === "formula") return html`<${Formula} option=${option} value=${value || ""} columns=${columns} onvalue=${onvalue} />`;
-    if (kind === "flag") return html`<div class="option"><label class="check"><input type="checkbox" ...${common} checked=${value === true} onchange=${(event) => onvalue(event.target.checked)} />${name}</label>${help}</div>`;
+    if (kind === "flag") return html`<div class="option"><label class="check"><input type="checkbox" ...${common} checked=${value === true} onchange=${(event) => onvalue(event.target.checked)} />${option.label}</label>${help}</div>`;
     if (kind === "choice" || kind === "column" || kind === "class") {
       const values = kind === "choice" ? choices : kind === "column" ? columns : classesOf(Studio.state.project);
       return html`<div class="option"><label>${label}<select ...${common} value=${value || ""} onchange=${(event) => onvalue(event.target.value)}>
         ${!(initial && values.includes(initial)) && html`<option value="">${required ? "" : kind === "choice" ? J.default : J.none}</option>`}
-        ${values.map((one) => html`<option key=${one} value=${one} selected=${one === value}>${one}</option>`)}</select></label>${help}</div>`;
+        ${values.map((one) => html`<option key=${one} value=${one} selected=${one === value}>${kind === "class" ? one.replace("=", ": ") : one}</option>`)}</select></label>${help}</div>`;
     }
     return html`<div class="option"><label>${label}<input ...${common} inputmode=${kind === "number" ? "decimal" : undefined} value=${value || ""} placeholder=${initial || required ? "" : J.default} oninput=${(event) => onvalue(event.target.value)} /></label>${help}</div>`;
   }
@@ -252,5 +251,5 @@
       ${Studio.isActive(job) && html`<${Button} edits small testid=${`elsewhere-cancel-${job.number}`} onclick=${() => Studio.act(`/api/jobs/${job.number}/cancel`)}>${J.cancel}<//>`}</p>`)}</div>`;
   };
 
-  Object.assign(Studio, { Elsewhere, Outdated, duration, kindOf, JobForm, JobPanel, ResultFrame, Settings, Jobs, useResult });
+  Object.assign(Studio, { Elsewhere, Outdated, duration, action, kindOf, JobForm, JobPanel, ResultFrame, Settings, Jobs, useResult });
 })();

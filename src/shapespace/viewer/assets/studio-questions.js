@@ -27,12 +27,12 @@
     const busy = Studio.jobsOf([kind]).some(Studio.isActive);
     const controls = html`
       <${Button} small testid="all-questions" onclick=${onback}>← ${Q.all}<//>
-      <h2>${T.jobs.kinds[kind]}</h2>
+      <h2>${Studio.action(kind)}</h2>
       <p class="hint">${ready ? Q.hints[kind] : Q.none}</p>
       <${Jobs} kinds=${[kind]} />
       ${job && html`<${Button} class="wide" strong=${!busy} testid="next" onclick=${next}>${T.next.questions}<//>`}
       <${Settings} key="settings" kinds=${[kind]}><${JobForm} kind=${kind} sources=${sources(kind)} strong=${!job && !busy} checked disabled=${!ready || busy} /><//>`;
-    return html`<${Step} name="question" title=${T.jobs.kinds[kind]} controls=${controls} select=${select} job=${job} empty=${Q.empty}>${job && html`<${Answer} job=${job} />`}<//>`;
+    return html`<${Step} name="question" title=${Studio.action(kind)} controls=${controls} select=${select} job=${job} empty=${Q.empty}>${job && html`<${Answer} job=${job} />`}<//>`;
   }
 
   Studio.Questions = function Questions({ next }) {
@@ -45,7 +45,7 @@
         <div class="row bar"><h2>${Q.title}</h2><span class="grow"></span>
           ${earlier.some((job) => job.status === "done") && html`<${Button} strong testid="next" onclick=${next}>${T.next.questions}<//>`}</div>
         <ul class="questions">
-          ${KINDS.filter((one) => Studio.forms[one]).map((one) => html`<li key=${one}><button type="button" data-testid=${`question-${one}`} onclick=${() => setQuestion({ kind: one })}><strong>${T.jobs.kinds[one]}</strong><span class="hint">${Q.hints[one]}</span></button></li>`)}
+          ${KINDS.filter((one) => Studio.forms[one] && !Studio.state.read_only).map((one) => html`<li key=${one}><button type="button" data-testid=${`question-${one}`} onclick=${() => setQuestion({ kind: one })}><strong>${Studio.action(one)}</strong><span class="hint">${Q.hints[one]}</span></button></li>`)}
         </ul>
         ${earlier.length > 0 && html`<h3>${Q.earlier}</h3>
           <ul class="recent">${earlier.map((job) => html`<li key=${job.number}><button type="button" data-testid=${`earlier-${job.number}`} onclick=${() => setQuestion({ kind: job.kind, first: job.number })}>

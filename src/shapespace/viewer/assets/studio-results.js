@@ -51,7 +51,7 @@
         ${outdated > 0 && html`<p class="outdated" role="status" data-testid="outdated">${T.export.outdated(outdated)}</p>`}
         <${Jobs} kinds=${["report", "convert", "export", "figures"]} />
         ${Studio.jobsOf(Studio.QUESTIONS).filter(Studio.isActive).map((job) => html`<${JobPanel} key=${job.number} job=${job} />`)}
-        ${Studio.newest("build") && Studio.forms.convert && html`<details class="narrow" data-testid="convert"><summary>${T.export.convert}</summary><${JobForm} kind="convert" sources=${["build"]} /></details>`}
+        ${Studio.newest("build") && Studio.forms.convert && !Studio.state.read_only && html`<details class="narrow" data-testid="convert"><summary>${T.export.convert}</summary><${JobForm} kind="convert" sources=${["build"]} /></details>`}
         ${!done.length ? html`<p class="hint">${T.export.none}</p>` : html`
           <div class="table-box" role="region" aria-label=${T.export.title} tabindex="0"><table class="plain">
             <thead><tr><th scope="col">${T.export.result}</th><th scope="col">${T.export.files}</th><th scope="col">${T.export.actions}</th></tr></thead>

@@ -105,7 +105,7 @@
 
   // Model -----------------------------------------------------------------------------------------------------------
 
-  const More = ({ kind, ...rest }) => Studio.forms[kind] ? html`<details data-testid=${`more-${kind}`}><summary>${T.jobs.kinds[kind]}</summary><p class="hint">${Studio.forms[kind].summary}</p><${JobForm} kind=${kind} ...${rest} /></details>` : null;
+  const More = ({ kind, ...rest }) => Studio.forms[kind] && !Studio.state.read_only ? html`<details data-testid=${`more-${kind}`}><summary>${Studio.action(kind)}</summary><p class="hint">${Studio.forms[kind].summary}</p><${JobForm} kind=${kind} ...${rest} /></details>` : null;
 
   /** The specimens that are selected in a frame's morphospace. */
   function useSelected(frame, specimens) {

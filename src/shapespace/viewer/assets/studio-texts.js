@@ -1,4 +1,4 @@
-/* All texts of the studio's page; a translation replaces this file. */
+/* Texts of the studio's page; the labels of actions and options are in cli/forms.py and come with the forms. */
 (function () {
   "use strict";
 
@@ -33,7 +33,7 @@
     },
 
     specimens: {
-      dropTitle: "Drop scans or folders here", dropHint: (formats) => `Mesh and point cloud files (${formats}), and a table (CSV or XLSX) of what is known about them.`,
+      dropTitle: "Drop scans or folders here", dropHint: (formats) => `Mesh and point cloud files (${formats}), and a table (CSV or XLSX) with their data.`,
       chooseFiles: "Choose files", chooseFolder: "Choose a folder", addHere: "Add from this machine", importTable: "Import a table",
       addTitle: "Add scans from this machine", byReference: "Refer to the files where they are", byCopy: "Copy the files into the project",
       addFolder: "Add this folder", added: (number) => `${count(number, "scan")} added.`,
@@ -70,11 +70,7 @@
     },
 
     jobs: {
-      kinds: {
-        correspond: "Correspondence", redo: "Correct one scan", build: "Build the model", quality: "Measure the quality", morphospace: "Draw the morphospace", figures: "Draw figures for print",
-        fit: "Fit the model", complete: "Complete partial scans", compare: "Do groups differ?", change: "Has it changed?", asymmetry: "Is it symmetric?",
-        regress: "Shape and a number?", score: "How unusual is it?", identify: "Who is it?", report: "Report", convert: "Convert the model", export: "Export",
-      },
+      kinds: { redo: "Correct one scan" },
       statuses: { waiting: "waiting", running: "running", done: "done", failed: "failed", cancelled: "cancelled", interrupted: "interrupted" },
       settings: "Settings, and run again", run: "Run", runAgain: "Run again", runOf: { correspond: "Bring into correspondence", build: "Build the model", fit: "Fit the scans" },
       more: (number) => `${count(number, "more option")}`, cancel: "Cancel", continue: "Continue", log: "Log", command: "Command", copy: "Copy", copied: "Copied",
@@ -86,7 +82,7 @@
         redone: "Made before a scan was registered again.", source: "Made from a result that is outdated; run that one again first.",
       }, source: "Made from", newest: "newest result",
       progress: ({ doing, done, total }) => total ? `${doing} (${done} of ${total})` : doing, progressLabel: (kind) => `Progress of: ${kind}`,
-      took: (time) => `took ${time}`, left: (time) => `about ${time} left`,
+      took: (time) => `took ${time}`, left: (time) => `about ${time} left in this step`,
       seconds: (value) => `${value} s`, minutes: (value) => `${value} min`, hours: (value) => `${value} h`,
       frame: (kind, output) => `${kind}: ${output}`, openReport: "Open the report", full: "Open in a tab of its own", views: { surfaces: "Surfaces", model: "3-D view", report: "Report" }, view: "View",
     },
@@ -108,7 +104,7 @@
       paper: "Text for the paper", copyPaper: "Copy the text", findings: "Result", figures: "Figures (SVG, PDF, PNG)", none: "Bring the specimens into correspondence first, or fit new scans.",
       hints: {
         compare: "Test whether shape is associated with sex, age, treatment or any other column.", change: "Measure the change between visits of the same subjects in millimetres.",
-        asymmetry: "Compare left with right: a score for each subject, and a map.", regress: "Predict a number, such as age, from shape (target), or the mean shape along it (along).",
+        asymmetry: "Compare left with right: a score for each subject, and a map.", regress: "Predict a number, such as age, from shape, or the mean shape along such a number.",
         score: "Compare each shape with a class, such as the controls: a percentile, and a map.", identify: "Find the subject of a scan among the enrolled ones.",
       },
       empty: "After the run, the answer in words, the figures and the text for the paper are shown here.",

@@ -120,7 +120,7 @@
     const head = table[0] || [];
     const named = (letter) => head.filter((name) => new RegExp(`^${letter}[1-9][0-9]*$`).test(name)).length;
     const letter = named("z") ? "z" : named("b") ? "b" : null;
-    if (!letter) throw new Error(`${file.name} has no columns z1, z2, ... or b1, b2, ...; give a coefficients.csv of shapespace fit.`);
+    if (!letter) throw new Error(`${file.name} has no columns z1, z2, ... or b1, b2, ...; give the coefficients.csv of a folder of fits.`);
     const columns = (of) => Array.from({ length: about.modes }, (_, k) => head.indexOf(`${of}${k + 1}`));
     const at = columns(letter), other = columns(letter === "z" ? "b" : "z");
     if (named(letter) !== about.modes || at.includes(-1)) {
@@ -145,7 +145,7 @@
       added += 1;
       if (added === 1) $("compare-b").dataset.wanted = `csv ${file.name} ${name}`;
     }
-    if (!added) throw new Error(`${file.name} has no row with numbers in all its coefficients; give a coefficients.csv of shapespace fit.`);
+    if (!added) throw new Error(`${file.name} has no row with numbers in all its coefficients; give the coefficients.csv of a folder of fits.`);
     fillChoices();
     $("compare-b").value = $("compare-b").dataset.wanted;
     Viewer.show("compare");

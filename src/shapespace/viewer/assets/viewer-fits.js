@@ -50,6 +50,7 @@
 
   async function start() {
     $("fits-none").hidden = page.about.has_fits;
+    if (window.parent !== window) $("fits-none").textContent = "This page shows a model without fits."; // in the studio or a notebook
     $("fits-some").hidden = !page.about.has_fits;
     if (!page.about.has_fits) return;
     page.fits = await json("api/fits");

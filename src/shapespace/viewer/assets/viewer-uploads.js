@@ -28,7 +28,7 @@
       else if (file.size > about.upload_bytes) {
         refused.push(`${file.name} is larger than the ${maxMegabytes()} MB that this viewer takes; thin it, or start the viewer with a larger --max-upload-mb.`);
       } else if (taken.length < about.kept) taken.push(file);
-      else refused.push(`${file.name} is not sent, because at most ${about.kept} scans are kept; fit more with shapespace fit.`);
+      else refused.push(`${file.name} is not sent, because at most ${about.kept} scans are kept; drop fewer at a time.`);
     }
     const records = taken.map((file) => ({ id: null, name: file.name, file, dense: $("dense").checked, ...fresh() }));
     page.dropped.push(...records);

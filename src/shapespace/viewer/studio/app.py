@@ -8,7 +8,7 @@ import threading
 import zipfile
 from collections.abc import AsyncGenerator, Callable, Generator, Mapping
 from contextlib import ExitStack, aclosing
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -30,18 +30,20 @@ from shapespace.types import MM_PER_UNIT
 from shapespace.version import __version__
 from shapespace.viewer.guard import Access, Guard, refusal
 from shapespace.viewer.server import (
-    PAGES,
     application,
     asset,
     body_pieces,
     display_name,
+    html_page,
     json_body,
     json_response,
+    route,
     whole_body,
 )
 from shapespace.viewer.studio.job_commands import (
     QUESTIONS,
     Forms,
+    OptionLabels,
     Outdated,
     checks,
     order,
@@ -76,12 +78,13 @@ class OpenProject:
         create: whether to create the project.
         changed: function that is called after each change.
         upload_bytes: size limit of a scan.
+        labels: labels of options in the messages of commands.
         read_only: whether nothing is written into the folder, in which a studio may run.
     """
 
     def __init__(
         self, folder: Path, forms: Forms, *, create: bool, changed: Callable[[], None], upload_bytes: int,
-        read_only: bool = False,
+        labels: OptionLabels, read_only: bool = False,
     ) -> None:  # fmt: skip
         self.project = Project.open(folder, create=create)
         self._resources = ExitStack()
@@ -89,7 +92,8 @@ class OpenProject:
             self._resources.enter_context(only_writer(self.project.folder))
         self.jobs = Jobs(self.project.folder, changed, read_only=read_only)
         self.checks = SpecimenChecks(self.project.folder, changed, self.project.exclude, read_only=read_only)
-        self.views = Views(self._result, upload_bytes)
+        self.views = Views(self._result, upload_bytes, labels)
+        self._sentence = labels.sentence
         self._forms = forms
         self._outdated: tuple[object, dict[int, Outdated]] = (None, {})
         for resource in (self.views, self.checks, self.jobs):
@@ -118,6 +122,7 @@ class OpenProject:
             specimens.append({
                 "id": specimen.id, "file": specimen.file, "set": specimen.role, "included": specimen.included,
                 "unit": specimen.unit, "mirrored": specimen.mirrored, "cells": specimen.cells, **facts,
+                "findings": [{**finding, "text": self._sentence(finding["text"])} for finding in facts["findings"]],
             })  # fmt: skip
         return {
             "name": state.name, "folder": str(project.folder), "revision": project.revision,
@@ -137,10 +142,11 @@ class OpenProject:
         sentences, methods = ([], None) if path is None else _words(path)
         return {
             "number": job.number, "kind": job.kind, "command": job.command, "status": job.status,
-            "message": job.message, "progress": progress, "seconds": self.jobs.running_for(job), "left_s": left_s,
-            "output": job.output, "options": job.options, "on": job.on,
+            "message": self._sentence(job.message), "progress": progress, "seconds": self.jobs.running_for(job),
+            "left_s": left_s, "output": job.output, "options": job.options, "on": job.on,
             "views": [{"kind": kind, "href": href} for kind, href in zip(kinds, pages, strict=False)],
-            "sentences": sentences, "methods": methods, "outdated": self._outdated[1].get(job.number),
+            "sentences": list(map(self._sentence, sentences)), "methods": methods and self._sentence(methods),
+            "outdated": self._outdated[1].get(job.number),
         }  # fmt: skip
 
 
@@ -175,7 +181,7 @@ class Studio:
 
     def __init__(self, forms: Forms, folder: Path | None, upload_bytes: int, *, read_only: bool = False) -> None:
         self.ends: Callable[[], bool] = lambda: False  # whether the server is about to end, and streams with it
-        self._forms = forms
+        self._forms, self._labels = forms, OptionLabels(forms)
         self._upload_bytes = upload_bytes
         self._read_only = read_only
         self._changes = 0
@@ -189,40 +195,40 @@ class Studio:
         """Return the application, without a guard."""
         job = "/api/jobs/{number:int}"
         routes = [
-            Route("/", self._page),
+            route("/", lambda _: html_page("studio")),
             Route("/assets/{name}", asset),
             Route("/api/project", self._state),
             Route("/api/events", self._events),
-            Route("/api/forms", self._list_forms),
+            route("/api/forms", lambda _: json_response(self._labels.forms)),
             Route("/api/open", self._open_project, methods=["POST"]),
             Route("/api/close", self._close_project, methods=["POST"]),
             Route("/api/folders", self._folders),
             Route("/api/specimens", self._upload, methods=["PUT"]),
             Route("/api/import", self._take_files, methods=["POST"]),
             Route("/api/thumbnails/{id}", self._thumbnail),
-            Route("/api/edit", self._edit, methods=["POST"]),
-            Route("/api/undo", self._undo, methods=["POST"]),
-            Route("/api/redo", self._redo, methods=["POST"]),
+            Route("/api/edit", partial(self._edit, Project.edit), methods=["POST"]),
+            Route("/api/undo", partial(self._edit, Project.undo), methods=["POST"]),
+            Route("/api/redo", partial(self._edit, Project.redo), methods=["POST"]),
             Route("/api/table", self._table, methods=["POST"]),
             Route("/api/paste", self._match_block, methods=["POST"]),
             Route("/api/checks", self._check, methods=["POST"]),
             Route("/api/jobs", self._add_job, methods=["POST"]),
-            Route(f"{job}/cancel", self._cancel, methods=["POST"]),
-            Route(f"{job}/continue", self._go_on, methods=["POST"]),
+            Route(f"{job}/cancel", partial(self._change_job, Jobs.cancel), methods=["POST"]),
+            Route(f"{job}/continue", partial(self._change_job, Jobs.go_on), methods=["POST"]),
             Route(f"{job}/log", self._log),
             Route(f"{job}/files", self._files),
-            Route("/api/history", self._history),
+            route("/api/history", lambda _: PlainTextResponse(history(self._project.jobs.all()))),
             Route("/files/{path:path}", self._file),
             Route("/zip/{number:int}", self._zip),
             Mount("/view", app=self._view),
         ]
         if self._read_only:
             routes = [
-                route if isinstance(route, Mount) or "GET" in (route.methods or ())
-                else Route(route.path, _reject_change, methods=list(route.methods or ()))
-                for route in routes
+                known if isinstance(known, Mount) or "GET" in (known.methods or ())
+                else Route(known.path, _reject_change, methods=list(known.methods or ()))
+                for known in routes
             ]  # fmt: skip
-        return application(routes, str)
+        return application(routes, self._labels.sentence)
 
     def close(self) -> None:
         """Close the project."""
@@ -245,13 +251,9 @@ class Studio:
             if self._open is not None and self._open.project.folder == folder.resolve():
                 return
             opened = OpenProject(
-                folder,
-                self._forms,
-                create=create,
-                changed=self._changed,
-                upload_bytes=self._upload_bytes,
-                read_only=self._read_only,
-            )
+                folder, self._forms, create=create, changed=self._changed, upload_bytes=self._upload_bytes,
+                labels=self._labels, read_only=self._read_only,
+            )  # fmt: skip
             self.close()
             self._open = opened
             if not self._read_only:
@@ -259,15 +261,6 @@ class Studio:
             self._changed()
 
     # The state
-
-    def _page(self, request: Request) -> Response:
-        return FileResponse(PAGES / "studio.html", media_type="text/html")
-
-    def _list_forms(self, request: Request) -> Response:
-        return json_response(self._forms)
-
-    def _history(self, request: Request) -> Response:
-        return PlainTextResponse(history(self._project.jobs.all()))
 
     def _state(self, request: Request) -> Response:
         return json_response(
@@ -337,7 +330,7 @@ class Studio:
         place, role, copy = _place(content.get("path")), _role(content.get("set")), bool(content.get("copy"))
         added, left_out = await run_in_threadpool(self._project.project.import_files, place, role, copy=copy)
         self._changed()
-        return json_response({"added": added, "left_out": left_out})
+        return json_response({"added": added, "left_out": list(map(self._labels.sentence, left_out))})
 
     def _thumbnail(self, request: Request) -> Response:
         opened, wanted = self._project, request.path_params["id"]
@@ -347,21 +340,10 @@ class Studio:
                 return FileResponse(picture, media_type="image/webp")
         raise HTTPException(404, "There is no picture of this specimen.")
 
-    async def _edit(self, request: Request) -> Response:
+    async def _edit(self, edit: Callable[..., None], request: Request) -> Response:
         content = await json_body(request, _TABLE_BYTES)
-        return self._apply_edit(lambda: self._project.project.edit(_revision(content), change_of(content)))
-
-    async def _undo(self, request: Request) -> Response:
-        content = await json_body(request, _REQUEST_BYTES)
-        return self._apply_edit(lambda: self._project.project.undo(_revision(content)))
-
-    async def _redo(self, request: Request) -> Response:
-        content = await json_body(request, _REQUEST_BYTES)
-        return self._apply_edit(lambda: self._project.project.redo(_revision(content)))
-
-    def _apply_edit(self, edit: Callable[[], None]) -> Response:
         try:
-            edit()
+            edit(self._project.project, _revision(content), *([change_of(content)] if edit is Project.edit else []))
         except StaleError as error:
             return refusal(409, str(error))
         self._changed()
@@ -406,18 +388,15 @@ class Studio:
             except InputError as error:
                 return json_response([{"level": "problem", "text": str(error)}])
         given = cast(dict[str, Any], options) if isinstance(options, dict) else {}
-        return json_response(checks(opened.project, self._forms, kind, given, shapes))
+        found = checks(opened.project, self._forms, kind, given, shapes)
+        return json_response([{**finding, "text": self._labels.sentence(finding["text"])} for finding in found])
 
-    def _cancel(self, request: Request) -> Response:
-        self._project.jobs.cancel(request.path_params["number"])
-        return json_response({})
-
-    def _go_on(self, request: Request) -> Response:
-        self._project.jobs.go_on(request.path_params["number"])
+    def _change_job(self, change: Callable[[Jobs, int], None], request: Request) -> Response:
+        change(self._project.jobs, request.path_params["number"])
         return json_response({})
 
     def _log(self, request: Request) -> Response:
-        return PlainTextResponse(self._project.jobs.log(request.path_params["number"]))
+        return PlainTextResponse(self._labels.sentence(self._project.jobs.log(request.path_params["number"])))
 
     # Results
 

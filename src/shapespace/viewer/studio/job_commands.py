@@ -1,9 +1,11 @@
-"""The commands of jobs: from the choices of the user on the page to the arguments of a shapespace command."""
+"""The commands of jobs: from the choices of the user on the page to the arguments of a shapespace command, and from
+the messages of commands, which name options, to sentences with the labels of the page."""
 
 from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Literal
 
@@ -13,14 +15,70 @@ from shapespace.viewer.studio.jobs import Job, Order
 from shapespace.viewer.studio.project import Project, Specimen
 
 Forms = Mapping[str, Mapping[str, Any]]
-"""Kind -> `command` (its words), `summary`, and `options`, each with `flag`, `argument`, `help`, `kind`, `choices`,
-`initial`, `visible` and `required`; `argument` is `--set NAME` for a setting, and empty for a positional argument."""
+"""Kind -> `command` (its words), `label`, `summary`, and `options`, each with `flag`, `argument`, `label`, `help`,
+`kind`, `choices`, `initial`, `visible` and `required`; `argument` is `--set NAME` for a setting, and empty for a
+positional argument."""
 
 QUESTIONS = ("compare", "change", "asymmetry", "regress", "score", "identify", "morphospace")
 CORRESPONDENCES = ("correspond", "redo")
 _STUDY = (*CORRESPONDENCES, "build", "quality", "morphospace", *QUESTIONS[:-1], "fit", "complete")
 """Kinds of results in the report of the study, in the order of its chapters."""
 _INPUTS = "inputs"
+_TERMINAL_NOTES = re.compile(
+    r" \([^()]*(?:NAME\.|MODEL\.h5|about\.json)[^()]*\)|; exit with \d [^.;]*|(?m:^(?:next|usage): .*\n?)"
+)
+"""Parts for the terminal alone: names of result files in parentheses, exit codes, usage, and the next command."""
+_ERROR = re.compile(r"shapespace [a-z ]+: error: (?:argument (?:-\w/)?(?:(--set|--[\w-]+(?=: must)):)?)?")
+"""The beginning of a message on an option with a wrong value."""
+_OPTION = re.compile(
+    r"(?P<quantity>\b(?:fewer|more|smaller|larger|such an?) (?!\())?(?P<parenthesis>\()?--(?P<name>set \w+|[a-z][\w-]*)"
+    r"(?: \([a-z]+_[a-z_]+\))?(?:(?P<equals>[ =])(?P<word>(?!out\b)\w[\w.,=-]*(?<![.,])))?(?P<end>(?=[.;:,)<\"\n]|$))?"
+)
+"""An option or setting, and its value or the next word."""
+_MARKUP = re.compile(r"<(script|style|pre|code)\b.*?</\1>|<[^>]*>|[^<]+", re.DOTALL)
+"""A part of an HTML page: code, a tag, or text."""
+
+
+class OptionLabels:
+    """The labels of options and actions on the page, for sentences that name options of commands.
+
+    Args:
+        forms: forms of the commands; the attribute contains them with labels in the help.
+    """
+
+    def __init__(self, forms: Forms) -> None:
+        self._options = {option["flag"]: option for form in forms.values() for option in form["options"]}
+        self._actions = {" ".join(form["command"]): form["label"] for form in forms.values()}
+        names = "|".join(sorted(self._actions, key=len, reverse=True)) or "(?!)"
+        self._action = re.compile(rf"(?:\bshapespace ({names})\b(?! \S+ -\w\b)|\b({names})(?= --))( (?=--))?")
+
+        self.forms = {
+            kind: {**form, "options": [{**option, "help": self.sentence(option["help"])} for option in form["options"]]}
+            for kind, form in forms.items()
+        }
+
+    def sentence(self, text: str) -> str:
+        """Return a text, such as "give landmarks (--landmarks)", with labels in place of options and commands."""
+        text = _ERROR.sub(r"\1", _TERMINAL_NOTES.sub("", text))
+        names = self._actions
+        text = self._action.sub(lambda at: f"“{names[at[1] or at[2]]}”{' and ' if at[3] else ''}", text)
+        return _OPTION.sub(self._label, text)
+
+    def page(self, html: str) -> str:
+        """Return an HTML page with labels in its text, but not in its commands."""
+        return _MARKUP.sub(lambda part: part[0] if part[0].startswith("<") else self.sentence(part[0]), html)
+
+    def _label(self, found: re.Match[str]) -> str:
+        """Return the label of an option with its value, or with the next word if it has no value."""
+        name, word = found["name"].removeprefix("set ").replace("_", "-"), found["word"] or ""
+        option = self._options.get(f"--{name}", {"label": name.replace("-", " ").capitalize(), "choices": ()})
+        before = found.string[: found.start()].rstrip()
+        article = "The" if not before or before[-1] in '.!?>"' or before.endswith("shapespace:") else "the"
+        noun = "option" if "flag" in option else "command-line option"
+        prefix = found["quantity"] or (f"({noun} " if found["parenthesis"] else f"{article} {noun} ")
+        is_value = found["equals"] == "=" or found["end"] is not None or word in option["choices"] or word[:1].isdigit()
+        has_none = not word or re.match(r"[A-Z]{2}|[A-Z]$", word)  # the name of a value
+        return f"{prefix}“{option['label']}”{'' if has_none else f': {word}' if is_value else f' {word}'}"
 
 
 def order(
@@ -196,21 +254,22 @@ def checks(
     drop_missing = options.get("--missing") == "drop"
     if drop_missing:
         chosen = [specimen for specimen in chosen if all(specimen.cells.get(column) for column in columns)]
-    enough = len(chosen) >= 2
     take = "specimen takes" if len(chosen) == 1 else "specimens take"
-    found = [{"level": "ok" if enough else "problem", "text": f"{len(chosen)} {take} part."}]
+    found = [{"level": "ok" if len(chosen) >= 2 else "problem", "text": f"{len(chosen)} {take} part."}]
     if kind == "score" and options.get("--reference"):
         members, others = map(len, _by_class(chosen, options["--reference"]))
         level = "problem" if members < 2 or not others else "warning" if members < 20 else "ok"
         text = f"{members} in the reference, {others} to score; percentiles have steps of 1 in {members + 1}."
         found.append({"level": level, "text": text})
     if kind == "regress" and bool(options.get("--target")) == bool(options.get("--along")):
-        text = "Choose one column: a target to predict a number from shape, or along to predict shapes along a number."
+        text = (
+            "Choose one column, by either --target or --along: to predict a number from shape, or shapes from a number."
+        )
         found.append({"level": "problem", "text": text})
     for column in columns:
         cells = [specimen.cells.get(column, "") for specimen in chosen]
         if missing[column]:
-            what = "these are excluded" if drop_missing else "fill it in, or exclude these with missing: drop"
+            what = "these are excluded" if drop_missing else "fill it in, or exclude these with --set missing=drop"
             text = f"{column} is missing for {missing[column]} of {of_all} specimens; {what}."
             found.append({"level": "warning" if drop_missing else "problem", "text": text})
         classes = {cell: cells.count(cell) for cell in dict.fromkeys(cells) if cell}
@@ -224,7 +283,7 @@ def checks(
             found.append({"level": "problem", "text": f"{column} has one value for all specimens; nothing can differ."})
     for option in forms.get(kind, {}).get("options", ()):
         if option["required"] and not options.get(option["flag"]):
-            found.append({"level": "problem", "text": f"Choose: {option['help'].partition(';')[0]}."})
+            found.append({"level": "problem", "text": f"Choose a value of {option['flag']}."})
     return found
 
 
@@ -338,14 +397,10 @@ def _surfaces(project: Project, before: Job) -> list[str]:
     made = {path.stem for path in (project.folder / before.output).glob("*.ply")}
     excluded = [specimen for specimen in project.state.specimens if not specimen.included and specimen.id in made]
     if excluded:
-        return list(_require_files(there))
+        if len(there) < 2:
+            raise InputError("Fewer than two included specimens are in correspondence; include more.")
+        return there
     return [before.output]
-
-
-def _require_files(paths: Sequence[str]) -> Sequence[str]:
-    if len(paths) < 2:
-        raise InputError("Fewer than two included specimens are in correspondence; include more.")
-    return paths
 
 
 def _model_ending(name: str) -> str:

@@ -11,8 +11,9 @@ from tempfile import TemporaryDirectory
 
 import anyio.to_thread
 from starlette._utils import get_route_path
-from starlette.responses import FileResponse
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.datastructures import MutableHeaders
+from starlette.responses import HTMLResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.schemas import CorrespondenceRecord
@@ -20,6 +21,7 @@ from shapespace.viewer.corresponding_surfaces import Surfaces
 from shapespace.viewer.guard import refusal
 from shapespace.viewer.model_view import ModelView
 from shapespace.viewer.server import model_app, surfaces_app
+from shapespace.viewer.studio.job_commands import OptionLabels
 from shapespace.viewer.uploaded_scans import FOLDER_PREFIX, Scans, UploadLimits
 
 REPORT, REPORT_PAGE = "report.html", "report"
@@ -51,10 +53,12 @@ class Views:
     Args:
         result: function that returns the path of the result of a job; None if it has none.
         upload_bytes: size limit of scans that are dropped onto a model's page.
+        labels: labels of options in the messages of commands.
     """
 
-    def __init__(self, result: Callable[[int], Path | None], upload_bytes: int) -> None:
+    def __init__(self, result: Callable[[int], Path | None], upload_bytes: int, labels: OptionLabels) -> None:
         self._result = result
+        self._labels = labels
         self._upload_bytes = upload_bytes
         self._open: OrderedDict[tuple[Path, int], tuple[ASGIApp, ExitStack]] = OrderedDict()
         self._lock = threading.Lock()
@@ -68,7 +72,8 @@ class Views:
             await refusal(404, "There is no page of this result; reload the studio.")(scope, receive, send)
         elif "report" in kinds and (kinds[0] == "report" or rest == f"{REPORT_PAGE}/"):
             file = path if path.name == REPORT else path / REPORT
-            await FileResponse(file, media_type="text/html", headers=REPORT_HEADERS)(scope, receive, send)
+            page = await anyio.to_thread.run_sync(lambda: self._labels.page(file.read_text(encoding="utf-8")))
+            await HTMLResponse(page, headers=REPORT_HEADERS)(scope, receive, send)
         else:
             try:
                 app = await anyio.to_thread.run_sync(self._app, path)
@@ -79,7 +84,7 @@ class Views:
             if not rest:
                 # Of the page itself, whose addresses are relative to the folder.
                 inner["path"] = f"{inner['root_path']}/"
-            await app(inner, receive, send)
+            await app(inner, receive, self._with_labels(send))
 
     def close(self) -> None:
         """Close all pages."""
@@ -87,6 +92,28 @@ class Views:
             for _, stack in self._open.values():
                 stack.close()
             self._open.clear()
+
+    def _with_labels(self, send: Send) -> Send:
+        """Return a function that sends a response, of which JSON gets labels of options."""
+        held: list[Message] = []
+
+        async def send_message(message: Message) -> None:
+            if (
+                message["type"] == "http.response.start"
+                and (b"content-type", b"application/json") in message["headers"]
+            ):
+                held.append(message)
+                return
+            if held:
+                start, message = (
+                    held.pop(),
+                    {**message, "body": self._labels.sentence(message["body"].decode()).encode()},
+                )
+                MutableHeaders(scope=start)["content-length"] = str(len(message["body"]))
+                await send(start)
+            await send(message)
+
+        return send_message
 
     def _app(self, path: Path) -> ASGIApp:
         record = path / CorrespondenceRecord.FILE
