@@ -33,7 +33,7 @@ _FILES = frozenset(
     for name in (
         "output", "shapes", "model", "table", "labels", "template", "subjects", "add", "redo", "remove", "update",
         "recursive", "dask", "executor", "predictor", "predict", "no-open", "json", "quiet", "all", "groups",
-        "surfaces", "set", "orientation",
+        "specimens", "surfaces", "set", "orientation",
     )
 )  # fmt: skip
 """Options that the studio sets itself, or that name files."""
