@@ -420,6 +420,30 @@ def test_a_result_that_is_run_again_with_the_same_settings_is_up_to_date(answere
     assert again not in answered.outdated and answered.outdated[3] == "table"
 
 
+@pytest.mark.parametrize(("kind", "options", "problem"), [
+    ("compare", {"--formula": "~ group"}, None),
+    ("compare", {"--formula": "~ group + log_size"}, None),
+    ("compare", {"--formula": "~ gruop"}, "gruop"),
+    ("compare", {"--formula": "~ group +"}, "formula"),
+    ("compare", {"--formula": "~ log(group)"}, "group"),
+    ("compare", {"--formula": "~ group", "--permutations": "many"}, "--permutations: 'many' is not a number"),
+    ("compare", {"--formula": "~ site"}, "site is missing for 1 of 4 specimens"),
+    ("compare", {"--formula": "~ site", "--missing": "drop"}, None),
+    ("compare", {}, "Choose a value of --formula"),
+    ("disparity", {"--group": "group"}, None),
+    ("disparity", {"--group": "code"}, "code has another value for each specimen; choose a column of classes"),
+    ("disparity", {}, "Choose a value of --group"),
+])  # fmt: skip
+def test_checks_before_a_run_find_what_the_command_would_reject(
+    project: Project, kind: str, options: dict[str, str], problem: str | None
+) -> None:
+    project.add(tetrahedron(project.new_file("dora.ply"), 5.0), "training")
+    join_table(project, b"id,group,code,site\nanna,a,x,n\nben,a,y,n\ncarl,b,z,s\ndora,b,w,\n")
+    found = checks(project, forms(summaries_and_options()), kind, options, None)
+    problems = [one["text"] for one in found if one["level"] == "problem"]
+    assert problems == [] if problem is None else any(problem in text for text in problems), problems
+
+
 GROUPS = {f"s{k:02}": ("a" if k % 2 else "b", f"g{k % 3}", str(20 + 3 * k)) for k in range(12)}
 
 

@@ -81,3 +81,14 @@ def test_every_action_of_the_page_ends_with_a_result_that_is_shown(tmp_path: Pat
         run(client, "export")
         run(client, "report", {}, fits)
         run(client, "report", {}, aligned)
+        for kind, options in {
+            "disparity": {"--group": "group"}, "equality": {"--group": "group", "--components": "2"},
+            "equivalence": {"--group": "group", "--margin": "5"},
+            "discriminant": {"--group": "group", "--components": "2"},
+            "power": {"--group": "group", "--simulations": "20", "--sizes": "8,16"}, "allometry": {"--group": "group"},
+            "pairwise": {"--formula": "~ group + age", "--group": "group"}, "repeatability": {"--subject": "person"},
+            "trajectory": {"--group": "group", "--points": "visit"}, "pls": {"--columns": "age,visit"},
+        }.items():  # fmt: skip
+            run(client, kind, options)
+        study = run(client, "report")
+        assert study["output"].endswith("/report.html") and study["views"]

@@ -7,8 +7,12 @@ from typing import Any
 
 from shapespace.cli.options import Option
 from shapespace.formats.registry import MODEL_FORMATS
+from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS
 
-_KINDS: Mapping[str, str] = {"identify": "recognise identify"}
+_KINDS: Mapping[str, str] = {
+    "identify": "recognise identify",
+    **{test.name: f"test {test.name}" for test in SHAPE_TESTS},
+}
 _FIRST: Mapping[str, tuple[str, ...]] = {
     "correspond": ("--vertices", "--mirror", "--pose"),
     "figures": ("--format",),
@@ -26,6 +30,13 @@ _FIRST: Mapping[str, tuple[str, ...]] = {
     "convert": ("--to",),
     "export": (),
     "report": (),
+    **{
+        test.name: (
+            *(f"--{name}" for name in test.required),
+            *(f"--{name}" for name, value in test.options.items() if value != "FORMULA" and name not in test.required),
+        )
+        for test in SHAPE_TESTS
+    },
 }
 """Command -> the options that its form shows; the others are folded."""
 _FILES = frozenset(
@@ -45,9 +56,24 @@ _ACTIONS: Mapping[str, str] = {
     "complete": "Complete partial scans", "compare": "Do groups differ?", "change": "Has it changed?",
     "asymmetry": "Is it symmetric?", "regress": "Shape and a number?", "score": "How unusual is it?",
     "identify": "Who is it?", "report": "Report", "convert": "Convert the model", "export": "Export",
+    "disparity": "Which group varies more?", "equality": "Do groups differ in mean or variation?",
+    "equivalence": "Are groups practically the same?", "power": "How many specimens are needed?",
+    "discriminant": "Can groups be told apart?", "pairwise": "Which pairs of groups differ?",
+    "trajectory": "Do groups change in the same way?", "allometry": "Does shape depend on size?",
+    "repeatability": "How repeatable is the measurement?", "pls": "Does shape vary with several measurements?",
+    "integration": "Do parts vary together?", "modularity": "Are parts independent modules?",
+    "signal": "Are related species similar?", "pgls": "Does shape vary with a trait along a phylogeny?",
 }  # fmt: skip
 """Command -> its name in the studio."""
+_QUESTIONS = frozenset(
+    {"compare", "change", "asymmetry", "regress", "score", "identify", *(t.name for t in SHAPE_TESTS)}
+)
 _LABELS: Mapping[str, str] = {
+    "anova-type": "Sums of squares", "columns": "Columns of measurements", "covariate": "Covariate", "effect": "Effect",
+    "margin": "Margin (distance)", "margin-sd": "Margin (standard deviations)", "modules": "File of modules",
+    "null": "Reduced model", "partial": "Partial disparity", "points": "Points of the trajectory",
+    "priors": "Prior probabilities", "residuals": "Residuals to permute", "separate": "Slope of each group",
+    "session": "Session", "simulations": "Simulations", "sizes": "Sample sizes",
     "additive": "Separate identity and expression", "again": "Fit all scans again", "along": "Predict shapes along",
     "at": "Values of the number", "axes": "Axes of the plot", "blocks": "Subjects with several scans",
     "bumps": "Width of local changes (mm)", "coding": "Coding of classes", "components": "Principal components",
@@ -94,7 +120,8 @@ def forms(commands: Mapping[str, tuple[str, Sequence[Option]]]) -> dict[str, dic
     for kind, first in _FIRST.items():
         command = _KINDS.get(kind, kind)
         made[kind] = {
-            "command": tuple(command.split()), "label": _ACTIONS[kind], **_make_form(kind, *commands[command], first)
+            "command": tuple(command.split()), "label": _ACTIONS[kind], "is_question": kind in _QUESTIONS,
+            **_make_form(kind, *commands[command], first)
         }  # fmt: skip
     made["convert"]["options"][0] |= {"kind": "choice", "choices": list(MODEL_FORMATS)}
     made["score"]["options"][0] |= {"kind": "class", "help": "class that the others are compared with"}

@@ -35,7 +35,7 @@
         ${!columns.length && html`<p class="hint">${T.questions.noColumns}</p>`}
         ${choices.map(([column, label]) => html`<label class="check" key=${column}><input type="checkbox" data-testid=${`term-${column}`} checked=${chosen.includes(quoted(column))} onchange=${() => toggle(column)} />${label}</label>`)}
       </fieldset>
-      <label class="option"><span>${T.questions.formula}</span><input data-testid=${`option${option.flag}`} placeholder="~ sex + age" title=${option.help} value=${value} spellcheck=${false} oninput=${(event) => onvalue(event.target.value)} /></label>`;
+      <label class="option"><span>${option.label}</span><input data-testid=${`option${option.flag}`} placeholder="~ sex + age" title=${option.help} value=${value} spellcheck=${false} oninput=${(event) => onvalue(event.target.value)} /></label>`;
   }
 
   /** The classes that are counted, as `column=value`. */
@@ -155,7 +155,7 @@
       <section class=${`job ${status}`} data-testid=${`job-${job.number}`} data-status=${status} aria-label=${`${kindOf(job)} ${job.number}`}>
         <div class="row"><strong>${kindOf(job)}</strong><span class="hint">${facts.join(", ")}</span><span class="grow"></span>
           ${active && html`<${Button} edits small testid=${`cancel-${job.number}`} onclick=${() => Studio.act(`/api/jobs/${job.number}/cancel`)}>${J.cancel}<//>`}
-          ${["cancelled", "failed", "interrupted"].includes(status) && html`<${Button} edits small testid=${`continue-${job.number}`} onclick=${() => Studio.act(`/api/jobs/${job.number}/continue`)}>${J.continue}<//>`}
+          ${job.can_continue && html`<${Button} edits small testid=${`continue-${job.number}`} onclick=${() => Studio.act(`/api/jobs/${job.number}/continue`)}>${J.continue}<//>`}
         </div>
         ${active && html`<progress max=${progress ? progress.total : undefined} value=${progress ? progress.done : undefined} aria-label=${J.progressLabel(kindOf(job))} data-testid=${`progress-${job.number}`}></progress>`}
         <p class="hint message" role="status">${active && progress ? J.progress(progress) : job.message}</p>

@@ -7,10 +7,12 @@
   const T = window.ShapespaceTexts;
   const Q = T.questions;
   const { Button, CopyButton, JobForm, Jobs, Settings, Step, useResult } = Studio;
-  const KINDS = ["compare", "change", "asymmetry", "regress", "score", "identify"];
+  const KINDS = []; // filled when the forms are known
   const CORRESPONDENCES = ["correspond", "redo"];
   const SOURCES = { identify: ["fit"] }; // others also take surfaces in correspondence
   const sources = (kind) => SOURCES[kind] || [...CORRESPONDENCES, "fit"];
+
+  const hint = (kind) => Q.hints[kind] || `${Studio.forms[kind].summary[0].toUpperCase()}${Studio.forms[kind].summary.slice(1)}.`;
 
   Studio.QUESTIONS = KINDS;
 
@@ -28,7 +30,7 @@
     const controls = html`
       <${Button} small testid="all-questions" onclick=${onback}>← ${Q.all}<//>
       <h2>${Studio.action(kind)}</h2>
-      <p class="hint">${ready ? Q.hints[kind] : Q.none}</p>
+      <p class="hint">${ready ? hint(kind) : Q.none}</p>
       <${Jobs} kinds=${[kind]} />
       ${job && html`<${Button} class="wide" strong=${!busy} testid="next" onclick=${next}>${T.next.questions}<//>`}
       <${Settings} key="settings" kinds=${[kind]}><${JobForm} kind=${kind} sources=${sources(kind)} strong=${!job && !busy} checked disabled=${!ready || busy} /><//>`;
@@ -45,7 +47,7 @@
         <div class="row bar"><h2>${Q.title}</h2><span class="grow"></span>
           ${earlier.some((job) => job.status === "done") && html`<${Button} strong testid="next" onclick=${next}>${T.next.questions}<//>`}</div>
         <ul class="questions">
-          ${KINDS.filter((one) => Studio.forms[one] && !Studio.state.read_only).map((one) => html`<li key=${one}><button type="button" data-testid=${`question-${one}`} onclick=${() => setQuestion({ kind: one })}><strong>${Studio.action(one)}</strong><span class="hint">${Q.hints[one]}</span></button></li>`)}
+          ${KINDS.filter((one) => Studio.forms[one] && !Studio.state.read_only).map((one) => html`<li key=${one}><button type="button" data-testid=${`question-${one}`} onclick=${() => setQuestion({ kind: one })}><strong>${Studio.action(one)}</strong><span class="hint">${hint(one)}</span></button></li>`)}
         </ul>
         ${earlier.length > 0 && html`<h3>${Q.earlier}</h3>
           <ul class="recent">${earlier.map((job) => html`<li key=${job.number}><button type="button" data-testid=${`earlier-${job.number}`} onclick=${() => setQuestion({ kind: job.kind, first: job.number })}>

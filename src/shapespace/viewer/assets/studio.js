@@ -103,6 +103,7 @@
     addEventListener("drop", (event) => event.preventDefault());
     addEventListener("beforeunload", (event) => { if (Studio.uploading()) event.preventDefault(); });
     Studio.forms = await Studio.json("/api/forms");
+    Studio.QUESTIONS.push(...Object.keys(Studio.forms).filter((kind) => Studio.forms[kind].is_question));
     await Studio.refresh();
     Studio.listen();
   }

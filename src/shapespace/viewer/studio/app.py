@@ -147,6 +147,8 @@ class OpenProject:
             "views": [{"kind": kind, "href": href} for kind, href in zip(kinds, pages, strict=False)],
             "sentences": list(map(self._sentence, sentences)), "methods": methods and self._sentence(methods),
             "outdated": self._outdated[1].get(job.number),
+            # A command that rejected its input would reject it again.
+            "can_continue": job.status in ("cancelled", "interrupted") or (job.status == "failed" and job.code != 2),
         }  # fmt: skip
 
 
@@ -388,7 +390,7 @@ class Studio:
             except InputError as error:
                 return json_response([{"level": "problem", "text": str(error)}])
         given = cast(dict[str, Any], options) if isinstance(options, dict) else {}
-        found = checks(opened.project, self._forms, kind, given, shapes)
+        found = await run_in_threadpool(checks, opened.project, self._forms, kind, given, shapes)
         return json_response([{**finding, "text": self._labels.sentence(finding["text"])} for finding in found])
 
     def _change_job(self, change: Callable[[Jobs, int], None], request: Request) -> Response:

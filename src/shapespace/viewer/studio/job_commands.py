@@ -10,7 +10,10 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Literal
 
 from shapespace.cohort.read import cohort_file_text
-from shapespace.errors import InputError
+from shapespace.cohort.table import Table, is_number
+from shapespace.errors import InputError, ShapespaceError
+from shapespace.statistics.compare_formula import design_of
+from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS
 from shapespace.viewer.studio.jobs import Job, Order
 from shapespace.viewer.studio.project import Project, Specimen
 
@@ -19,7 +22,10 @@ Forms = Mapping[str, Mapping[str, Any]]
 `kind`, `choices`, `initial`, `visible` and `required`; `argument` is `--set NAME` for a setting, and empty for a
 positional argument."""
 
-QUESTIONS = ("compare", "change", "asymmetry", "regress", "score", "identify", "morphospace")
+QUESTIONS = (
+    "compare", "change", "asymmetry", "regress", "score", "identify", *(test.name for test in SHAPE_TESTS),
+    "morphospace",
+)  # fmt: skip
 CORRESPONDENCES = ("correspond", "redo")
 _STUDY = (*CORRESPONDENCES, "build", "quality", "morphospace", *QUESTIONS[:-1], "fit", "complete")
 """Kinds of results in the report of the study, in the order of its chapters."""
@@ -281,10 +287,37 @@ def checks(
             found.append({"level": "ok", "text": f"{column}: {len(classes)} values."})
         if len(classes) == 1:
             found.append({"level": "problem", "text": f"{column} has one value for all specimens; nothing can differ."})
+    are_known = not any(missing.values()) or drop_missing
     for option in forms.get(kind, {}).get("options", ()):
-        if option["required"] and not options.get(option["flag"]):
-            found.append({"level": "problem", "text": f"Choose a value of {option['flag']}."})
+        value = str(options.get(option["flag"]) or "").strip()
+        text = ""
+        if option["required"] and not value:
+            text = f"Choose a value of {option['flag']}."
+        elif value and option["kind"] == "number" and not is_number(value):
+            text = f"{option['flag']}: {value[:40]!r} is not a number."
+        elif value and option["kind"] == "formula" and are_known and len(chosen) >= 2:
+            text = _problem_of_formula(value, project.state.columns, chosen)
+        elif (
+            value in columns
+            and option["flag"] in ("--group", "--points")
+            and len(chosen) == len({specimen.cells.get(value) for specimen in chosen})
+        ):
+            text = f"{value} has another value for each specimen; choose a column of classes."
+        if text:
+            found.append({"level": "problem", "text": text})
     return found
+
+
+def _problem_of_formula(formula: str, columns: Sequence[str], specimens: Sequence[Specimen]) -> str:
+    """Return why a formula cannot be used for specimens whose named cells are known; empty if it can."""
+    cells = {column: tuple(specimen.cells.get(column, "") for specimen in specimens) for column in columns}
+    sizes = tuple(str(1 + k) for k in range(len(specimens)))  # any numbers: the sizes of shapes are not known yet
+    table = Table({"log_size": sizes, **cells}, tuple(specimen.id for specimen in specimens), "The table")
+    try:
+        design_of(formula, table)
+    except ShapespaceError as error:
+        return str(error)
+    return ""
 
 
 Outdated = Literal["specimens", "table", "landmarks", "redone", "source"]
