@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from pages import hear_signals
-from pictures import same_as_kept
+from pictures import change, drawn_share, same_as_kept
 
 from shapespace.cli import main
 from shapespace.model.shape_model import ShapeModel
@@ -155,6 +155,25 @@ def is_outdated_until_undone(tab, user: User) -> None:
     tab.page.get_by_test_id("outdated").wait_for(state="detached")
 
 
+def turn_scan(tab) -> None:
+    """Open a raw scan in 3-D, look at it from behind, and close it."""
+    tab.page.get_by_test_id("show-bone_000").click()
+    view = tab.page.get_by_test_id("scan-view")
+    tab.until("document.querySelector('[data-testid=scan-view]').dataset.ready === 'true'")
+    tab.page.wait_for_timeout(800)
+    front = view.screenshot()
+    assert drawn_share(front) > 0.05
+    length, unit = tab.page.get_by_test_id("scan-scale").inner_text().split(" ", 1)
+    assert float(length) in (5, 10, 20, 50, 100) and unit == "units of the file"
+    tab.page.get_by_test_id("scan-back").click()
+    tab.page.wait_for_timeout(800)
+    assert change(front, view.screenshot()) > 0.01
+    tab.shot("scan")
+    assert barriers(tab) == []
+    tab.page.keyboard.press("Escape")
+    view.wait_for(state="detached")
+
+
 def write_bones(folder: Path, count: int) -> Path:
     assert main(["data", "bones", "-o", str(folder), "--count", str(count), "--quiet"]) == 0
     return folder
@@ -262,6 +281,7 @@ def test_what_was_dropped_edited_and_excluded_is_there_after_a_restart(open_tab,
         # The table is taken after the scans; an undo before would take it back.
         tab.until("document.querySelector('[data-testid=upload-notes]')?.textContent.includes('bones.csv')")
         assert "bone_001" in tab.page.get_by_test_id("upload-notes").text_content()
+        turn_scan(tab)
         tab.page.get_by_test_id("include-bone_002").click()
         tab.page.get_by_test_id("undo").click()
         tab.page.get_by_test_id("include-bone_000").click()

@@ -15,7 +15,7 @@ from typing import Any
 import httpx
 import pytest
 from test_studio_project import tetrahedron
-from viewer_world import enter, sentence, served
+from viewer_world import enter, sentence, served, unpacked
 
 from shapespace.cli.command_table import summaries_and_options
 from shapespace.cli.forms import forms
@@ -79,6 +79,11 @@ def test_dropped_scans_are_checked_pictured_and_listed(tmp_path: Path) -> None:
         assert broken["state"] == "unusable" and str(tmp_path) not in broken["findings"][0]["text"]
         assert client.get("/api/thumbnails/s0").content[8:12] == b"WEBP"
         assert client.get("/api/thumbnails/broken").status_code == 404
+        _, surface = unpacked(client.get("/api/scans/s0").content)
+        assert surface["positions"].shape == (4, 3) and surface["faces"].shape == (4, 3) and not len(surface["borders"])
+        answer = client.get("/api/scans/broken")
+        assert answer.status_code == 422 and str(tmp_path) not in answer.json()["error"]
+        assert client.get("/api/scans/nobody").status_code == 404
 
 
 def test_what_cannot_be_taken_is_refused_in_a_sentence(tmp_path: Path) -> None:

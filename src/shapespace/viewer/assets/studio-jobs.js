@@ -79,11 +79,11 @@
   }
 
   /** The form of a command with its checks and its button. */
-  function JobForm({ kind, sources = [], strong, checked, disabled, label, children }) {
+  function JobForm({ kind, sources = [], defaults, strong, checked, disabled, label, children }) {
     const form = Studio.forms[kind];
     const initial = useMemo(() => Object.fromEntries((form ? form.options : []).map((option) => [option.flag, option.initial === null ? "" : option.initial])), [form]);
     // The settings open as the last run had them.
-    const [values, setValues] = useState(() => ({ ...initial, ...Studio.jobsOf([kind])[0]?.options }));
+    const [values, setValues] = useState(() => ({ ...initial, ...defaults, ...Studio.jobsOf([kind])[0]?.options }));
     const [on, setOn] = useState("");
     const [checks, setChecks] = useState(null);
     const [starting, setStarting] = useState(false);

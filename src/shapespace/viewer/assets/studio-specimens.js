@@ -15,15 +15,38 @@
   Studio.Include = ({ specimen, label }) => html`<label class="include"><input type="checkbox" checked=${specimen.included} aria-label=${S.includeOne(specimen.id)} data-testid=${`include-${specimen.id}`}
     disabled=${specimen.state === "unusable" || Studio.state.read_only} onchange=${(event) => include(specimen, event.target)} />${label && html`<span aria-hidden="true">${label}</span>`}</label>`;
 
+  /** A button that opens a scan in 3-D. */
+  Studio.ShowScan = function ShowScan({ specimen }) {
+    const [open, setOpen] = useState(false);
+    if (specimen.state === "waiting") return null;
+    return html`<${Button} small class="quiet show-scan" aria-label=${S.scan.show(specimen.id)} testid=${`show-${specimen.id}`} onclick=${() => setOpen(true)}>${S.scan.open}<//>
+      ${open && html`<${Studio.Scan} specimen=${specimen} onclose=${() => setOpen(false)} />`}`;
+  };
+
   /** A select of units; the first one leaves scans as they are. */
   Studio.Unit = ({ value, onunit, ...rest }) => html`<select value=${value} onchange=${(event) => onunit(event.target)} ...${rest}>
     ${["", ...Studio.state.units].map((unit) => html`<option value=${unit}>${S.unit(unit)}</option>`)}</select>`;
 
-  Studio.Findings = ({ specimen }) => html`
-    ${specimen.state === "waiting" && html`<p class="finding waiting">${S.states.waiting}</p>`}
-    ${specimen.findings.map((finding) => html`<p class=${`finding ${finding.level}`} title=${finding.text}>${S[finding.level]}${finding.text}</p>`)}`;
+  /** Why a scan cannot be used; repairs and notes in one line, which unfolds. */
+  Studio.Findings = ({ specimen }) => {
+    const line = (finding) => html`<p class=${`finding ${finding.level}`} title=${finding.text}>${S[finding.level]}${finding.text}</p>`;
+    const refused = specimen.findings.filter((finding) => finding.level === "refused"), others = specimen.findings.filter((finding) => finding.level !== "refused");
+    return html`
+      ${specimen.state === "waiting" && html`<p class="finding waiting">${S.states.waiting}</p>`}
+      ${refused.map(line)}
+      ${others.length > 0 && html`<details class="findings-more"><summary>${S.found(others.filter((finding) => finding.level === "fixed").length, others.filter((finding) => finding.level === "note").length)}</summary>${others.map(line)}</details>`}`;
+  };
 
-  function Card({ specimen, selected, onselect }) {
+  // Blue, orange, green, ...: those of the figures, for the classes of the first column.
+  const COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"];
+
+  /** The classes of a specimen as a text that is compared: [column, class, colour] each, the first column in colour. */
+  function groupsOf(specimen, counts) {
+    const columns = Object.entries(counts);
+    return JSON.stringify(columns.map(([column, classes], k) => [column, specimen.cells[column] || "", k ? "" : COLOURS[Object.keys(classes).filter(Boolean).sort().indexOf(specimen.cells[column])] || ""]).filter(([, name]) => name));
+  }
+
+  function Card({ specimen, groups, selected, onselect }) {
     return useMemo(() => html`
       <li class=${`card ${specimen.included ? "" : "excluded"}`} data-testid=${`card-${specimen.id}`} data-state=${specimen.state}>
         <button type="button" class="picture" aria-pressed=${selected} data-testid=${`select-${specimen.id}`} onclick=${(event) => onselect(specimen.id, event)}>
@@ -32,19 +55,19 @@
             ? html`<img class=${specimen.mirrored ? "mirrored" : ""} src=${`/api/thumbnails/${encodeURIComponent(specimen.id)}`} alt="" loading="lazy" />`
             : html`<span>${S.states[specimen.state]}</span>`}
         </button>
-        <div class="row"><${Studio.Include} specimen=${specimen} /><strong title=${specimen.id}>${specimen.id}</strong>${specimen.set === "new" && html`<span class="tag">${S.new}</span>`}
+        <div class="row"><${Studio.Include} specimen=${specimen} /><strong title=${specimen.id}>${specimen.id}</strong><${Studio.ShowScan} specimen=${specimen} />${specimen.set === "new" && html`<span class="tag">${S.new}</span>`}
           ${specimen.mirrored && html`<span class="tag">${S.mirrored}</span>`}${specimen.unit && html`<span class="tag">${S.unit(specimen.unit)}</span>`}</div>
+        ${groups !== "[]" && html`<div class="row">${JSON.parse(groups).map(([column, name, colour]) => html`<span class="tag group" title=${`${column}: ${name}`}>${colour && html`<i style=${{ background: colour }}></i>`}${name}</span>`)}</div>`}
         <${Studio.Findings} specimen=${specimen} />
-      </li>`, [specimen, selected, onselect]);
+      </li>`, [specimen, groups, selected, onselect]);
   }
 
   /** Notes on the table, and the number of specimens of each class. */
-  const isClasses = ([, classes]) => Object.entries(classes).some(([name, number]) => name && number > 1);
   const About = ({ project }) => html`
     ${project.notes.length > 0 && html`<section class="notes" aria-label=${S.notes} data-testid="notes"><h3>${S.notes}</h3>${project.notes.map((note) => html`<p>${note}</p>`)}</section>`}
-    ${Object.entries(project.counts).some(isClasses) && html`
+    ${Object.keys(project.counts).length > 0 && html`
       <section aria-label=${S.classes} class="counts" data-testid="counts">
-        ${Object.entries(project.counts).filter(isClasses).map(([column, classes]) => html`
+        ${Object.entries(project.counts).map(([column, classes]) => html`
           <dl key=${column}><dt>${column}</dt>${Object.entries(classes).map(([name, number]) => html`<dd><span class=${name ? "" : "hint"}>${name || S.noClass}</span> <b>${number}</b>
             <meter aria-hidden="true" min="0" max=${Math.max(...Object.values(classes))} value=${number}></meter></dd>`)}</dl>`)}
       </section>`}`;
@@ -186,7 +209,7 @@
         </div>
         ${!listed.length && html`<p class="hint">${S.nothing}</p>`}
         ${layout === "cards"
-          ? html`<ul class="cards" data-testid="cards">${shown.map((one) => html`<${Card} key=${one.id} specimen=${one} selected=${selection.has(one.id)} onselect=${select} />`)}</ul>`
+          ? html`<ul class="cards" data-testid="cards">${shown.map((one) => html`<${Card} key=${one.id} specimen=${one} groups=${groupsOf(one, project.counts)} selected=${selection.has(one.id)} onselect=${select} />`)}</ul>`
           : html`<${Studio.Table} listed=${listed} shown=${shown} columns=${project.columns} selection=${selection} onselect=${select} onselectall=${selectAll} />`}
         ${listed.length > limit && html`<${Button} class="more" testid="show-more" onclick=${() => setLimit(limit + SHOWN)}>${S.more(Math.min(SHOWN, listed.length - limit))}<//>`}
       <//>`;

@@ -74,6 +74,7 @@
         <td class="tick"><input type="checkbox" checked=${specimen.mirrored} aria-label=${S.mirrorOne(specimen.id)} data-testid=${`mirror-${specimen.id}`} disabled=${Studio.state.read_only} onchange=${(event) => setMirror(specimen, event.target)} /></td>
         <td class="number">${specimen.extent ? specimen.extent.toLocaleString("en", { maximumSignificantDigits: 3 }) : ""}</td>
         <td class="number">${specimen.triangles ? specimen.triangles.toLocaleString("en") : ""}</td>
+        <td><${Studio.ShowScan} specimen=${specimen} /></td>
         <td class="findings"><${Studio.Findings} specimen=${specimen} /></td>
       </tr>`, [specimen, row, columns, selected, onselect, onblock]);
   }
@@ -135,7 +136,7 @@
             ${columns.map((name) => html`<th scope="col" key=${name}><span class="head">${name}
               <${Button} edits small class="quiet" aria-label=${S.removeColumn(name)} testid=${`remove-column-${name}`} onclick=${() => setRemoving(name)}>×<//></span></th>`)}
             <th scope="col">${S.columns.set}</th><th scope="col">${S.columns.unit}</th><th scope="col">${S.columns.mirror}</th>
-            <th scope="col" class="number">${S.columns.extent}</th><th scope="col" class="number">${S.columns.size}</th><th scope="col">${S.columns.findings}</th>
+            <th scope="col" class="number">${S.columns.extent}</th><th scope="col" class="number">${S.columns.size}</th><th scope="col">${S.scan.open}</th><th scope="col">${S.columns.findings}</th>
           </tr></thead>
           <tbody>${shown.map((specimen, row) => html`<${Row} key=${specimen.id} specimen=${specimen} row=${row} columns=${columns} selected=${selection.has(specimen.id)} onselect=${onselect} onblock=${onblock} />`)}</tbody>
         </table>

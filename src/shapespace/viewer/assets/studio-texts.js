@@ -51,6 +51,11 @@
       mirror: "Mirror", unmirror: "Do not mirror", mirrored: "mirrored",
       cell: (column, id) => `${column} of ${id}`, rename: (id) => `Name of ${id}`, tableLabel: "Table of specimens",
       pasteHint: "Click a cell to edit it; Enter and the arrow keys move. Paste a sheet of a spreadsheet with its names into the first cell, or a block of values into the cell where it begins.",
+      scan: {
+        show: (id) => `Show ${id} in 3-D`, open: "3-D", label: (id) => `The scan ${id} in 3-D`, reading: "Reading the scan", failed: "The 3-D view cannot be loaded; reload the page.", sides: "Sides",
+        front: "Front", back: "Back", left: "Left", right: "Right", top: "Top", bottom: "Bottom", units: "units of the file",
+        axes: "The axes are those of the file: front looks along -z, with y up. Drag to turn, scroll to zoom.", borders: "Red: borders of holes.",
+      },
       paste: {
         title: (number) => `Paste the cells of ${count(number, "specimen")}?`, action: "Paste",
         byName: "Each row goes to the specimen that it names.",
@@ -60,7 +65,8 @@
       states: { waiting: "being checked", ready: "ready", unusable: "cannot be used" }, new: "new", training: "training",
       summary: (all, included, unusable) => `${count(all, "specimen")}, ${included} included${unusable ? `, ${unusable} cannot be used` : ""}`,
       notes: "Look at the table", classes: "Classes", noClass: "(empty)", more: (number) => `Show ${number} more`,
-      repaired: "Repaired: ", refused: "Cannot be used: ", note: "", nothing: "No specimen matches the filter.",
+      found: (repairs, notes) => [repairs && count(repairs, "repair"), notes && count(notes, "note")].filter(Boolean).join(", "),
+      fixed: "Repaired: ", refused: "Cannot be used: ", note: "", nothing: "No specimen matches the filter.",
     },
     uploads: {
       progress: (done, total) => `Adding file ${Math.min(done + 1, total)} of ${total}`, finished: (added) => `${count(added, "file")} added.`,

@@ -32,6 +32,7 @@ from shapespace.viewer.guard import Access, Guard, refusal
 from shapespace.viewer.server import (
     application,
     asset,
+    binary,
     body_pieces,
     display_name,
     html_page,
@@ -208,6 +209,7 @@ class Studio:
             Route("/api/specimens", self._upload, methods=["PUT"]),
             Route("/api/import", self._take_files, methods=["POST"]),
             Route("/api/thumbnails/{id}", self._thumbnail),
+            Route("/api/scans/{id}", self._scan),
             Route("/api/edit", partial(self._edit, Project.edit), methods=["POST"]),
             Route("/api/undo", partial(self._edit, Project.undo), methods=["POST"]),
             Route("/api/redo", partial(self._edit, Project.redo), methods=["POST"]),
@@ -341,6 +343,14 @@ class Studio:
             if picture is not None and picture.is_file():
                 return FileResponse(picture, media_type="image/webp")
         raise HTTPException(404, "There is no picture of this specimen.")
+
+    async def _scan(self, request: Request) -> Response:
+        opened, wanted = self._project, request.path_params["id"]
+        for specimen in opened.project.state.specimens:
+            if specimen.id == wanted:
+                surface = opened.checks.surface(opened.project.path(specimen), mirrored=specimen.mirrored)
+                return binary(await asyncio.wrap_future(surface))
+        raise HTTPException(404, "There is no such specimen; reload the page.")
 
     async def _edit(self, edit: Callable[..., None], request: Request) -> Response:
         content = await json_body(request, _TABLE_BYTES)

@@ -92,12 +92,14 @@ class State(Struct, frozen=True, kw_only=True):
         return [note for note in notes if not note.startswith("Shapes in each class")]
 
     def counts(self) -> dict[str, dict[str, int]]:
-        """Return the number of included specimens of each class, of columns with few classes."""
-        counts = {
-            column: Counter(specimen.cells.get(column, "") for specimen in self.specimens if specimen.included)
-            for column in self.columns
-        }
-        return {column: dict(count) for column, count in counts.items() if 0 < len(count) <= _MOST_CLASSES}
+        """Return the number of included specimens of each class, of columns with few classes that specimens share."""
+        counts: dict[str, dict[str, int]] = {}
+        for column in self.columns:
+            of_all = Counter(specimen.cells.get(column, "") for specimen in self.specimens)
+            if len(of_all) <= _MOST_CLASSES and any(name and count > 1 for name, count in of_all.items()):
+                used = Counter(specimen.cells.get(column, "") for specimen in self.specimens if specimen.included)
+                counts[column] = {name: used[name] for name in of_all}
+        return counts
 
 
 class Project:

@@ -15,16 +15,22 @@ from typing import Any
 import numpy as np
 
 from shapespace.batch.workers import context, end_after
-from shapespace.errors import FileError, ShapespaceError
+from shapespace.errors import FileError, InputError, ShapespaceError
 from shapespace.geometry.doctor import examine_and_repair
+from shapespace.geometry.mirror_plane import mirror_image
+from shapespace.geometry.normals import boundary_edges
 from shapespace.io.files import write_bytes, write_text
 from shapespace.io.meshes.mesh_io import read_mesh
+from shapespace.report.inputs.correspondence_folder import drawable
+from shapespace.report.render.scene import decimate, pack
 from shapespace.report.render.thumbnails import mesh_still
 from shapespace.types import Mesh
 from shapespace.viewer.fitting import lower_priority
 
 _FOLDER = "checks"
 _MOST_PROCESSES = 4
+_MOST_DRAWN, _MOST_TURNING = 100_000, 12_000  # triangles of a scan in its view, at rest and while it turns
+_MOST_BORDERS = 50_000  # edges of borders that are drawn
 
 
 class SpecimenChecks:
@@ -65,6 +71,13 @@ class SpecimenChecks:
     def picture(self, scan: Path) -> Path:
         """Return the path of the picture of a scan, which exists once it was checked and is usable."""
         return self._folder / f"{_key(scan)}.webp"
+
+    def surface(self, scan: Path, *, mirrored: bool) -> Future[bytes]:
+        """Return the packed surface of a scan for a view, as it is in its file or reflected at x = 0.
+
+        The future raises a ShapespaceError if the scan cannot be read.
+        """
+        return self._processes().submit(pack_scan, scan, mirrored=mirrored)
 
     def close(self) -> None:
         """End the processes."""
@@ -137,9 +150,33 @@ def check_scan(scan: Path, stem: Path) -> dict[str, Any]:
             picture, _ = mesh_still(repaired)
             write_bytes(stem.with_suffix(".webp"), picture)
     except ShapespaceError as error:
-        facts = _unusable(str(error).replace(f"{scan.parent}{os.sep}", ""))
+        facts = _unusable(_without_folder(error, scan))
     write_text(stem.with_suffix(".json"), json.dumps(facts))
     return facts
+
+
+def pack_scan(scan: Path, *, mirrored: bool) -> bytes:
+    """Return the surface of a scan for a view: its triangles or points, those drawn while it turns, and its borders.
+
+    Raises:
+        InputError: it cannot be read, or is damaged.
+    """
+    try:
+        mesh = read_mesh(scan)
+    except ShapespaceError as error:
+        raise InputError(_without_folder(error, scan)) from error
+    mesh = drawable(mirror_image(mesh) if mirrored else mesh)[0]
+    drawn, _ = decimate(mesh, _MOST_DRAWN)
+    turning, kept = decimate(drawn, _MOST_TURNING)
+    arrays: dict[str, Any] = {"positions": drawn.vertices}
+    if drawn.faces is not None and turning.faces is not None and mesh.faces is not None:
+        arrays |= {"faces": drawn.faces.astype(np.uint32), "draft": kept[turning.faces].astype(np.uint32)}
+        arrays["borders"] = mesh.vertices[boundary_edges(mesh.faces)[:_MOST_BORDERS]].reshape(-1, 3)
+    return pack(arrays, {"name": scan.name})
+
+
+def _without_folder(error: ShapespaceError, scan: Path) -> str:
+    return str(error).replace(f"{scan.parent}{os.sep}", "")
 
 
 def _unusable(text: str) -> dict[str, Any]:
