@@ -145,6 +145,16 @@ def cluster() -> Iterator[Any]:
         yield client
 
 
+@pytest.fixture(scope="module")
+def few_modes() -> Iterator[None]:
+    """Search poses with few smooth modes, which blobs need no more of; this takes most of the time of a test."""
+    from shapespace.correspondence import template
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(template, "MODES", 15)
+        yield
+
+
 @pytest.fixture
 def write(tmp_path: Path):
     """Write text or bytes to a file of the given name and return its path."""

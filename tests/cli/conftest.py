@@ -1,7 +1,7 @@
 """A small model and scans on disk, made by the command line itself, and a way to run it."""
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -12,7 +12,6 @@ import pytest
 from shapespace.batch import progress
 from shapespace.batch.warm import COMPILING
 from shapespace.cli import main
-from shapespace.correspondence import template
 from shapespace.io.landmarks.landmark_io import write_landmark_indices
 from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.types import FloatArray, Mesh
@@ -24,14 +23,6 @@ Z = (
     np.array([-0.8, 0.6, 0.2, -1.0, 0.5]),
     np.array([0.3, 1.1, -0.9, 0.1, 0.4]),
 )
-
-
-@pytest.fixture(scope="module")
-def few_modes() -> Iterator[None]:
-    """Search poses with few smooth modes, which blobs need no more of; this takes most of the time of a test."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(template, "MODES", 15)
-        yield
 
 
 @dataclass(frozen=True)

@@ -153,7 +153,7 @@ def test_figures_draw_the_chosen_views_of_an_answer(run: Run, home: Path) -> Non
     assert endings == {".svg", ".png", ".txt"}
     assert "the views are front, side" in run("figures", "out", "--views", "dorsal").sentence()
     assert "choose from svg, pdf, png" in run("figures", "out", "--format", "gif").sentence()
-    assert run("figures", "same").out == "5 files in same/figures\n"  # of a correspondence
+    assert run("figures", "same", "--dpi", 80).out == "5 files in same/figures\n"  # of a correspondence
     (home / "empty").mkdir()
     assert "contains no fits" in run("figures", "empty").sentence()
 

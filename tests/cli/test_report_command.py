@@ -75,7 +75,8 @@ def test_the_model_of_other_fits_is_refused(run: Run, folder: Path, world: World
     assert "not the model of the fits" in outcome.sentence()
 
 
-def test_a_report_that_cannot_be_written_is_told(run: Run, folder: Path) -> None:
+def test_a_report_that_cannot_be_written_is_told(run: Run, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shapespace.report.pages.folder_page.FolderPage.html", lambda self: "<!DOCTYPE html>")
     outcome = run("report", folder, "--no-open", "-o", folder)
     assert outcome.code == 2
     assert str(folder) in outcome.sentence()

@@ -23,8 +23,8 @@ def star() -> Mesh:
     """Return a body with four arms of different lengths, which is not its own mirror image."""
     from scipy.spatial import ConvexHull
 
-    golden = np.arange(1500) + 0.5
-    height, turn = 1 - 2 * golden / 1500, np.pi * (1 + 5**0.5) * golden
+    golden = np.arange(1000) + 0.5
+    height, turn = 1 - 2 * golden / 1000, np.pi * (1 + 5**0.5) * golden
     around = np.sqrt(1 - height**2)
     directions = np.stack([around * np.cos(turn), around * np.sin(turn), height], axis=1)
     faces = ConvexHull(directions).simplices
@@ -58,7 +58,7 @@ def template() -> Mesh:
 
 def test_a_limb_is_followed_along_the_surface(template: Mesh) -> None:
     truth = bent(template)
-    scan = resample(Mesh(truth, template.faces, name="scan"), 1500)
+    scan = resample(Mesh(truth, template.faces, name="scan"), 1000)
     shapes = bent_shapes(IntrinsicShape.of(template, Harmonics.of(template, 100)), IntrinsicShape.of_scan(scan), 0)
     moved = np.linalg.norm(truth - template.vertices, axis=1).max()
     errors = [np.linalg.norm(shape - truth, axis=1).mean() for shape in shapes]
@@ -99,7 +99,7 @@ def test_extreme_shapes_of_a_subject_follow_through_intermediate_ones() -> None:
 
 def test_a_limb_that_moved_comes_into_correspondence(template: Mesh) -> None:
     scans = [Mesh(template.vertices, template.faces, name="rest")]
-    scans += [resample(Mesh(bent(template), template.faces, name=name), 1200) for name in ("one", "two")]
+    scans += [resample(Mesh(bent(template), template.faces, name=name), 800) for name in ("one", "two")]
     made = correspond(scans, CorrespondConfig(rounds=1, mirror="never"), template=replace(template, name="template"))
     for scan in made.scans[1:]:
         assert scan.vertices is not None

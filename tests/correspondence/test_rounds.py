@@ -15,12 +15,13 @@ from synthetic_shapes import sphere
 
 QUICK = ElasticSettings(harmonics=150, points=1000)
 SETTINGS = CorrespondConfig(vertices=900, rounds=2, mirror="never", first=QUICK, next=QUICK)
-HOLED, METRES, OTHER = 2, 3, 8
+BLOBS, HOLED, METRES = 6, 2, 3
+OTHER = BLOBS
 
 
 @pytest.fixture(scope="module")
 def blobs() -> list[RawBlob]:
-    return [raw_blob(k) for k in range(8)]
+    return [raw_blob(k) for k in range(BLOBS)]
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +40,7 @@ def made(scans: list[Mesh]) -> Correspondence:
 
 
 def surfaces(made: Correspondence) -> list[np.ndarray]:
-    found = [np.array(scan.vertices) for scan in made.scans[:8]]
+    found = [np.array(scan.vertices) for scan in made.scans[:BLOBS]]
     found[METRES] *= 1e3
     return found
 
@@ -50,7 +51,7 @@ def test_the_same_vertex_is_the_same_place_on_all(blobs: list[RawBlob], made: Co
 
 
 def test_surfaces_lie_on_their_scans_in_their_own_unit(scans: list[Mesh], made: Correspondence) -> None:
-    for k, scan in enumerate(made.scans[:8]):
+    for k, scan in enumerate(made.scans[:BLOBS]):
         there = scan.observed
         unit = 1e-3 if k == METRES else 1.0
         assert build_engine(scans[k]).query(scan.vertices[there]).distance.mean() < 0.5 * unit
@@ -59,7 +60,7 @@ def test_surfaces_lie_on_their_scans_in_their_own_unit(scans: list[Mesh], made: 
 
 
 def test_what_a_scan_does_not_show_is_missing_and_nothing_else(scans: list[Mesh], made: Correspondence) -> None:
-    for k, scan in enumerate(made.scans[:8]):
+    for k, scan in enumerate(made.scans[:BLOBS]):
         assert scan.seen == scan.observed.mean() and np.isfinite(scan.vertices).all()
         assert (0.97 < scan.seen < 0.993) if k == HOLED else scan.seen > 0.995
 
@@ -70,14 +71,14 @@ def test_surfaces_are_complete_and_estimates_lie_near_the_true_surface(
     meshes = made.meshes()
     assert meshes[HOLED].observed is not None and all(np.isfinite(mesh.vertices).all() for mesh in meshes)
     hidden = meshes[HOLED].vertices[~made.scans[HOLED].observed]
-    # The hole has a radius of 25 mm; the other seven shapes say where its surface is.
+    # The hole has a radius of 25 mm; the other shapes say where its surface is.
     assert build_engine(blobs[HOLED].truth).query(np.ascontiguousarray(hidden)).distance.mean() < 2.0
 
 
 def test_another_object_is_set_aside_with_a_reason(made: Correspondence) -> None:
-    assert [bool(scan.reason) for scan in made.scans] == [False] * 8 + [True]
+    assert [bool(scan.reason) for scan in made.scans] == [False] * BLOBS + [True]
     assert made.scans[OTHER].vertices is None
-    assert len(made.meshes()) == 8
+    assert len(made.meshes()) == BLOBS
 
 
 def test_a_template_given_keeps_its_triangles(scans: list[Mesh], blobs: list[RawBlob]) -> None:

@@ -22,7 +22,7 @@ from shapespace.report.inputs.correspondence_folder import Corresponded
 
 QUICK = ElasticSettings(harmonics=60, points=500, iterations=10)
 CONFIG = CorrespondConfig(vertices=300, rounds=2, mirror="never", first=QUICK, next=QUICK)
-BLOBS = [raw_blob(k, points=700) for k in range(8)]
+BLOBS = [raw_blob(k, points=700) for k in range(6)]
 MIRRORED = 2
 DOUBTED = 0.9  # probability of a right surface below which it is doubtful
 SURE = SurfaceEvidence(relief_agreement=1.3, usual_relief_agreement=1.3, consensus_deg=3.0)
@@ -68,6 +68,7 @@ def test_an_added_scan_has_a_status_of_its_own() -> None:
     assert mirrored.status == "doubtful" or mirrored.reason
 
 
+@pytest.mark.usefixtures("few_modes")
 def test_build_leaves_doubtful_surfaces_out_with_a_note_and_includes_them_on_request(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -95,16 +96,18 @@ def test_build_leaves_doubtful_surfaces_out_with_a_note_and_includes_them_on_req
         name: [*(["doubtful"] if name in doubtful else []), *(r.code for r in own)] for name, own in reviews.items()
     }
     assert summary["needs_review"] == {name: own for name, own in codes.items() if own}
-    assert f"{len(summary['needs_review'])} of 8 surfaces need" in output.out
+    assert f"{len(summary['needs_review'])} of {len(BLOBS)} surfaces need" in output.out
     for scan in (one.scan for one in BLOBS):
         record = json.loads((tmp_path / "same" / f"{scan.name}.correspond.json").read_text())
         assert (record["status"] == "doubtful") == (scan.name in doubtful) == (record["probability"] < DOUBTED)
         assert (f"{scan.name} is doubtful: {record['doubt']}" in output.err + output.out) == (scan.name in doubtful)
     assert main(["build", same, "-o", str(tmp_path / "m.h5"), "--quiet"]) == 0
-    assert f"{len(doubtful)} of 8 surfaces are doubtful and excluded ({doubtful[0]}" in capsys.readouterr().err
-    assert ss.ShapeModel.load(tmp_path / "m.h5").n_training == 8 - len(doubtful)
+    assert (
+        f"{len(doubtful)} of {len(BLOBS)} surfaces are doubtful and excluded ({doubtful[0]}" in capsys.readouterr().err
+    )
+    assert ss.ShapeModel.load(tmp_path / "m.h5").n_training == len(BLOBS) - len(doubtful)
     assert main(["build", same, "-o", str(tmp_path / "all.h5"), "--quiet", "--with-doubtful"]) == 0
-    assert ss.ShapeModel.load(tmp_path / "all.h5").n_training == 8
+    assert ss.ShapeModel.load(tmp_path / "all.h5").n_training == len(BLOBS)
 
 
 def test_limbs_that_can_be_assigned_otherwise_make_a_surface_doubtful() -> None:

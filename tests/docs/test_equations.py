@@ -66,6 +66,7 @@ def numbers_in(text: str, *, ranges: bool = True) -> set[str]:
     return found
 
 
+@cache
 def prose_of_code(file: Path) -> str:
     """Return the comments and docstrings of a file."""
     text = file.read_text("utf-8")

@@ -32,7 +32,7 @@ def test_the_grid_tells_a_point_nearly_as_near_as_the_nearest() -> None:
     dims = grid.near.shape
     middles = grid.origin[:, 0] + 7.0 * (np.stack(np.meshgrid(*map(np.arange, dims), indexing="ij"), axis=-1) + 0.5)
     places = middles.reshape(-1, 3)
-    told = np.linalg.norm(grid.look_up(places.T[None])[0].T - places, axis=1)
+    told = np.linalg.norm(grid.look_up(np.ascontiguousarray(places.T)[None])[0][0].T - places, axis=1)
     nearest = np.sqrt(KdTree(points).nearest(places)[1])
     assert (told >= nearest - 1e-9).all()
     # Cells compare by their middles, so a cell's diagonal may be lost, and little beyond.
@@ -43,7 +43,7 @@ def test_the_grid_tells_a_point_nearly_as_near_as_the_nearest() -> None:
 def test_outside_its_box_the_grid_tells_what_its_border_does() -> None:
     points = blob(sphere(400)[0], Z)
     grid = rigid.NearGrid.of(points, SIZE)
-    far = grid.look_up(np.array([[[1e6, -1e6], [0.0, 0.0], [0.0, 0.0]]]))[0]
+    far = grid.look_up(np.array([[[1e6, -1e6], [0.0, 0.0], [0.0, 0.0]]]))[0][0]
     assert np.allclose(far[:, 0], points[points[:, 0].argmax()], atol=30.0)
     assert np.allclose(far[:, 1], points[points[:, 0].argmin()], atol=30.0)
 

@@ -167,6 +167,16 @@ def sketched(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
+def worded(sketched: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave the stills of the cards out too, for tests of words that neither damage surfaces nor count bytes."""
+    from shapespace.report.render import thumbnails
+
+    strip = thumbnails.encoded(np.full((10, 30, 3), 255, dtype=np.uint8))
+    monkeypatch.setattr(thumbnails, "fit_strip", lambda *_: strip)
+    monkeypatch.setattr(thumbnails, "correspondence_strip", lambda *_: strip)
+
+
+@pytest.fixture
 def fits(fits_template: Path, tmp_path: Path) -> Path:
     """A copy of the folder of fits that may be damaged."""
     shutil.copytree(fits_template, tmp_path / "work")

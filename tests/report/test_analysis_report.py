@@ -74,7 +74,7 @@ def analysis(tmp_path: Path, head: Callable[..., Mesh]) -> Path:
 
 
 @pytest.fixture
-def undrawn(sketched: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def undrawn(worded: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(figures, "encode_webp", lambda *_, **__: (b"webp", (10, 10)))
 
 

@@ -322,13 +322,13 @@ def test_many_scans_that_were_set_aside_leave_room_for_the_others(same: Path) ->
     assert "Excluded scans: they are not in a model" in page and "The reasons of 34 scans" in page
 
 
-def test_a_mean_shape_that_lacks_what_scans_show_is_told(same: Path) -> None:
+def test_a_mean_shape_that_lacks_what_scans_show_is_told(same: Path, sketched: None) -> None:
     for name in NAMES:
         edit(same, lambda record: record.update(area_share=0.7), f"{name}.correspond.json")
     assert "its surface is 70 % of the median scan's" in Page(report(same)).words
 
 
-def test_what_quality_measured_has_its_section(same: Path) -> None:
+def test_what_quality_measured_has_its_section(same: Path, worded: None) -> None:
     assert "Quality of the shape space" not in Page(report(same)).headings
     (same / "quality.json").write_text(json.dumps({"compactness": [0.6, 0.9], "sentences": ["Two modes are enough."]}))
     page = Page(report(same))
@@ -337,7 +337,7 @@ def test_what_quality_measured_has_its_section(same: Path) -> None:
     assert "quality.json is damaged" in Page(report(same)).words
 
 
-def test_holes_of_the_mean_shape_are_told(same: Path) -> None:
+def test_holes_of_the_mean_shape_are_told(same: Path, sketched: None) -> None:
     assert "beside its border" not in Page(report(same)).words
     mean = read_mesh(same / "template" / "mean.ply")
     at = [int(mean.vertices[:, axis].argmax()) for axis in (0, 1, 2)]
@@ -347,7 +347,7 @@ def test_holes_of_the_mean_shape_are_told(same: Path) -> None:
     assert "The mean shape has 2 holes in addition to its border." in Page(report(same)).words
 
 
-def test_scans_in_mixed_units_are_compared_by_their_size(same: Path) -> None:
+def test_scans_in_mixed_units_are_compared_by_their_size(same: Path, worded: None) -> None:
     edit(same, lambda record: record.update(scale=0.001), "able.correspond.json")
     assert "The scans are in different units" in Page(report(same)).words
 

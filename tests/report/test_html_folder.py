@@ -127,7 +127,7 @@ def test_failed_and_doubtful_fits_come_first_with_their_reason(page: str) -> Non
     assert "broken.ply" in words and "No picture: the scan cannot be read." in words
 
 
-def test_coefficients_by_different_models_are_never_compared(fits: Path, sketched: None) -> None:
+def test_coefficients_by_different_models_are_never_compared(fits: Path, worded: None) -> None:
     def other(record: dict[str, Any]) -> None:
         record["model"]["hash"] = "0" * 64
 
@@ -140,7 +140,7 @@ def test_coefficients_by_different_models_are_never_compared(fits: Path, sketche
 
 
 @pytest.mark.parametrize(("subject", "drawn"), [("s1", True), ("", False)])
-def test_lines_through_neutral_need_one_known_subject(fits: Path, sketched: None, subject: str, drawn: bool) -> None:
+def test_lines_through_neutral_need_one_known_subject(fits: Path, worded: None, subject: str, drawn: bool) -> None:
     rows = [("able", "calm", "0.5"), ("baker", "calm", "1"), ("charlie", "neutral", "0"), ("dog", "wild", "1")]
     write_rows(fits / "labels.csv", ("file", "expression", "intensity", "subject"), [(*row, subject) for row in rows])
     assert ("Larger marks are stronger expressions" in Page(report(fits)).words) == drawn
@@ -154,7 +154,7 @@ def test_messages_about_result_files_name_no_folder_of_the_machine(fits: Path, s
     assert str(fits.parent.parent) not in words
 
 
-def test_labels_are_found_beside_the_scans_and_can_be_given(fits: Path, sketched: None) -> None:
+def test_labels_are_found_beside_the_scans_and_can_be_given(fits: Path, worded: None) -> None:
     assert "Labels are from scans/labels.csv, next to the scans." in Page(report(fits)).words
     (fits / "labels.csv").write_text("name,label\nable,LOCAL\n")
     words = Page(report(fits)).words
@@ -165,7 +165,7 @@ def test_labels_are_found_beside_the_scans_and_can_be_given(fits: Path, sketched
 
 @pytest.mark.parametrize("content", [b"\xff\xfe\x00", b"", b"file\nable.ply\n", b"a,b\n1,2\n", b'file,label\n"x'])
 def test_a_damaged_table_of_labels_is_refused_when_given_and_told_when_found(
-    fits: Path, sketched: None, content: bytes
+    fits: Path, worded: None, content: bytes
 ) -> None:
     (fits / "labels.csv").write_bytes(content)
     with pytest.raises(FileFormatError, match=r"labels\.csv"):
@@ -232,7 +232,7 @@ def test_a_record_with_a_part_of_another_kind_never_stops_the_report(
     assert "6 fits in out" in Page(report(fits)).headings
 
 
-def test_a_model_that_was_moved_is_asked_for_and_taken(fits: Path, sketched: None) -> None:
+def test_a_model_that_was_moved_is_asked_for_and_taken(fits: Path, worded: None) -> None:
     shutil.move(fits.parent / "model.h5", fits.parent / "elsewhere.h5")
     page = report(fits)
     assert page.count('class="broken"') == 1 and "give it with --model" in Page(page).words
@@ -242,13 +242,13 @@ def test_a_model_that_was_moved_is_asked_for_and_taken(fits: Path, sketched: Non
         report(fits, model=fits.parent / "wrong.h5")
 
 
-def test_scores_of_recognition_are_shown_where_there_are_some(fits: Path, sketched: None) -> None:
+def test_scores_of_recognition_are_shown_where_there_are_some(fits: Path, worded: None) -> None:
     (fits / "recognition.json").write_text(json.dumps({"accuracy": 0.875, "by_class": {"calm": 0.5, EVIL: 1.0}}))
     words = Page(report(fits)).words
     assert "Recognition" in words and "0.875" in words and EVIL in words
 
 
-def test_the_quality_of_the_model_is_shown_where_it_was_measured(fits: Path, sketched: None) -> None:
+def test_the_quality_of_the_model_is_shown_where_it_was_measured(fits: Path, worded: None) -> None:
     assert "Generalisation" not in Page(report(fits)).words
     (fits / "quality.json").write_text(json.dumps({"compactness": [0.5, 0.8], "generalisation": [2.0, 1.5]}))
     assert "Generalisation" in Page(report(fits)).words

@@ -101,7 +101,7 @@ def study(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def undrawn(sketched: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def undrawn(worded: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out the drawing where a test is of what stands around it; the figures still check what they are given."""
     monkeypatch.setattr(figures, "encode_webp", lambda *_, **__: (b"webp", (10, 10)))
 

@@ -310,8 +310,9 @@ class Completion:
         return self.draw_samples()
 
     def _mesh(self, vertices: FloatArray, observed: BoolArray | None = None) -> Mesh:
-        landmarks = self.model.landmarks.positions(vertices)
-        return Mesh(vertices, self.model.faces, landmarks, self.scan_name, observed=observed)
+        return Mesh(
+            vertices, self.model.faces, self.model.landmarks.positions(vertices), self.scan_name, observed=observed
+        )
 
 
 def complete(

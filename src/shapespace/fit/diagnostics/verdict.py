@@ -26,8 +26,9 @@ def judge(method: Method, ended: FitOutcome) -> tuple[Status, tuple[Reason, ...]
         return "doubtful", tuple(doubts)
     for phase in (1, 2):
         if ended.phases[phase].stopped == "cap":
-            data = {"phase": phase, "iterations": ended.phases[phase].iteration}
-            return "max_iterations", (Reason(ReasonCode.ITERATION_LIMIT, data),)
+            return "max_iterations", (
+                Reason(ReasonCode.ITERATION_LIMIT, {"phase": phase, "iterations": ended.phases[phase].iteration}),
+            )
     return "converged", (method.reason(ended),)
 
 

@@ -21,6 +21,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
+from shapespace.compiled import compiled
 from shapespace.fit.search.shape_search import ShapePoints, shape_search
 from shapespace.geometry.kdtree import KdTree
 from shapespace.geometry.normals import rms_size, vertex_normals
@@ -58,17 +59,33 @@ class NearGrid(NamedTuple):
         order = np.argsort(-((inside % 1.0 - 0.5) ** 2).sum(axis=1))
         holder = np.full(np.ceil((high - low) / cell).astype(int) + 1, -1, dtype=np.int32)
         holder[tuple(inside[order].astype(int).T)] = order
-        nearest = distance_transform_edt(holder < 0, return_distances=False, return_indices=True)
-        return NearGrid(holder[tuple(nearest)], np.ascontiguousarray(points.T), low[:, None], cell)
+        near = holder[tuple(distance_transform_edt(holder < 0, return_distances=False, return_indices=True))]
+        return NearGrid(near, np.ascontiguousarray(points.T), low[:, None], cell)
 
-    def look_up(self, places: FloatArray) -> FloatArray:
-        """Return a point near to each of `places` (S, 3, N), in the same order; outside the grid, near its border."""
-        _, ny, nz = self.near.shape
-        cells = np.clip((places - self.origin) / self.cell, 0.0, np.array(self.near.shape)[:, None] - 1.0).astype(
-            np.int32
-        )
-        nearest: IntArray = self.near.reshape(-1)[(cells[:, 0] * ny + cells[:, 1]) * nz + cells[:, 2]]
-        return self.points.take(nearest, axis=1).transpose(1, 0, 2)
+    def look_up(self, places: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return a point near to each of `places` (S, 3, N), and their squared distances (S, N).
+
+        A place outside the grid has a point near the border.
+        """
+        near, squared = np.empty(places.shape), np.empty((places.shape[0], places.shape[2]))
+        _look_up_into(self, places, near, squared)
+        return near, squared
+
+
+@compiled
+def _look_up_into(grid: NearGrid, places: FloatArray, near_out: FloatArray, squared_out: FloatArray) -> None:
+    """Write the results of `NearGrid.look_up`."""
+    for s in range(len(places)):
+        for i in range(places.shape[2]):
+            x, y, z = places[s, 0, i], places[s, 1, i], places[s, 2, i]
+            nearest = grid.near[
+                int(min(max(0.0, (x - grid.origin[0, 0]) / grid.cell), grid.near.shape[0] - 1.0)),
+                int(min(max(0.0, (y - grid.origin[1, 0]) / grid.cell), grid.near.shape[1] - 1.0)),
+                int(min(max(0.0, (z - grid.origin[2, 0]) / grid.cell), grid.near.shape[2] - 1.0)),
+            ]
+            u, v, w = grid.points[0, nearest], grid.points[1, nearest], grid.points[2, nearest]
+            near_out[s, 0, i], near_out[s, 1, i], near_out[s, 2, i] = u, v, w
+            squared_out[s, i] = (x - u) * (x - u) + (y - v) * (y - v) + (z - w) * (z - w)
 
 
 def edge_of(sides: FloatArray, cells: int) -> float:
@@ -109,18 +126,19 @@ def rigid_search(
         R = _best_rotations(H - (total * scan_mean)[:, :, None] * model_mean[:, None])
         t = scan_mean - (R @ model_mean[:, :, None])[:, :, 0]
     _, _, forward, backward = _matches(R, t, model, scan, model_grid, scan_grid)
-    score = sum(np.minimum(np.sqrt(squared), cap).mean(axis=1) for squared in (forward, backward))
-    return R, t, 0.5 * np.asarray(score)
+    capped = (np.minimum(np.sqrt(squared), cap).mean(axis=1) for squared in (forward, backward))
+    return R, t, 0.5 * np.asarray(sum(capped))
 
 
 def _matches(
     R: FloatArray, t: FloatArray, model: FloatArray, scan: FloatArray, model_grid: NearGrid, scan_grid: NearGrid
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return scan points near to `model`, (S, 3, M), model points near to `scan`, (S, 3, N), squared distances."""
-    in_scan = R @ model.T + t[:, :, None]
-    in_model = R.transpose(0, 2, 1) @ (scan.T - t[:, :, None])
-    y, x = scan_grid.look_up(in_scan), model_grid.look_up(in_model)
-    return y, x, ((in_scan - y) ** 2).sum(axis=1), ((in_model - x) ** 2).sum(axis=1)
+    (y, forward), (x, backward) = (
+        scan_grid.look_up(R @ model.T + t[:, :, None]),
+        model_grid.look_up(R.transpose(0, 2, 1) @ (scan.T - t[:, :, None])),
+    )
+    return y, x, forward, backward
 
 
 def _best_rotations(H: FloatArray) -> FloatArray:
@@ -318,8 +336,9 @@ class _Sides:
         scan = np.array(scan_mm[np.random.default_rng(seed).permutation(_thin_evenly(scan_mm, cell, side.size))])
         # A surface crosses about 1.5 cells per squared edge, so the coarser count determines the area.
         spacing = 2 * cell * math.sqrt(len(_thin_evenly(scan, 2 * cell, side.size)) / 1.5 / len(scan))
-        slack = np.array([1.5 * max(spacing, 0.5 * side.spacing), 1.2 * side.spacing])
-        return _Sides(side, scan, KdTree(scan), slack, with_scale)
+        return _Sides(
+            side, scan, KdTree(scan), np.array([1.5 * max(spacing, 0.5 * side.spacing), 1.2 * side.spacing]), with_scale
+        )
 
     def upright(self) -> PoseCandidate:
         """Return the better of two poses without rotation: aligned centroids, or aligned outermost parts."""
