@@ -19,7 +19,6 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.types import Mesh
 from synthetic_shapes import sphere
 
-pytestmark = pytest.mark.usefixtures("few_modes")
 SCANS = 4
 QUICK = ("--mirror", "never", "--vertices", "500", "--rounds", "1", "--jobs", "1", "--quiet")
 

@@ -205,7 +205,6 @@ def say(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., str
     return run
 
 
-@pytest.mark.usefixtures("few_modes")
 def test_what_is_odd_about_a_scan_is_said_and_kept(say: Callable[..., str], tmp_path: Path) -> None:
     crumb, faces = sphere(100)
     x = SCANS[2].vertices

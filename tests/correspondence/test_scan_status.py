@@ -68,7 +68,6 @@ def test_an_added_scan_has_a_status_of_its_own() -> None:
     assert mirrored.status == "doubtful" or mirrored.reason
 
 
-@pytest.mark.usefixtures("few_modes")
 def test_build_leaves_doubtful_surfaces_out_with_a_note_and_includes_them_on_request(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -564,6 +564,5 @@ def _measure_distances(
     Distances are in mm of the scan. If `region` (V,) is given, only its vertices count.
     """
     vertices = T.apply(model.reconstruct(b)) if vertices_scan_mm is None else vertices_scan_mm
-    return surface_distances(
-        Mesh(vertices, model.faces, name="model"), target.mesh, scan_engine=target.engine, region=region
-    )
+    placed = Mesh(vertices, model.faces, name="model")
+    return surface_distances(placed, target.mesh, scan_engine=target.engine, region=region)

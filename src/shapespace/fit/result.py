@@ -263,13 +263,8 @@ class FitResult:
                 "omit the model, as the result contains its own."
             )
         vertices = self._vertices(stage)
-        return Mesh(
-            vertices,
-            self.model.faces,
-            self.model.landmarks.positions(vertices),
-            self.scan_name,
-            self.colours.get(stage),
-        )
+        landmarks = self.model.landmarks.positions(vertices)
+        return Mesh(vertices, self.model.faces, landmarks, self.scan_name, self.colours.get(stage))
 
     def save(self, folder: str | PathLike[str], name: str = "", *, stages: bool = False) -> Path:
         """Write the files that `shapespace fit` writes, and return the path of the record, NAME.fit.json.

@@ -310,9 +310,8 @@ class Completion:
         return self.draw_samples()
 
     def _mesh(self, vertices: FloatArray, observed: BoolArray | None = None) -> Mesh:
-        return Mesh(
-            vertices, self.model.faces, self.model.landmarks.positions(vertices), self.scan_name, observed=observed
-        )
+        landmarks = self.model.landmarks.positions(vertices)
+        return Mesh(vertices, self.model.faces, landmarks, self.scan_name, observed=observed)
 
 
 def complete(

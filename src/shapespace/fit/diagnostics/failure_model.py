@@ -534,9 +534,5 @@ def _find_few_shapes(evidence: FitEvidence) -> list[Reason]:
     shapes, beyond_mm = evidence.training_shapes, evidence.beyond_model_mm
     if not 0 < shapes < _FEW_SHAPES or beyond_mm < _LEAVES_SPAN * evidence.size_mm:
         return []
-    return [
-        Reason(
-            ReasonCode.FEW_TRAINING_SHAPES,
-            {"training_shapes": shapes, "beyond_model_mm": beyond_mm, "fewest_shapes": _FEW_SHAPES},
-        )
-    ]
+    data = {"training_shapes": shapes, "beyond_model_mm": beyond_mm, "fewest_shapes": _FEW_SHAPES}
+    return [Reason(ReasonCode.FEW_TRAINING_SHAPES, data)]

@@ -26,9 +26,8 @@ def judge(method: Method, ended: FitOutcome) -> tuple[Status, tuple[Reason, ...]
         return "doubtful", tuple(doubts)
     for phase in (1, 2):
         if ended.phases[phase].stopped == "cap":
-            return "max_iterations", (
-                Reason(ReasonCode.ITERATION_LIMIT, {"phase": phase, "iterations": ended.phases[phase].iteration}),
-            )
+            data = {"phase": phase, "iterations": ended.phases[phase].iteration}
+            return "max_iterations", (Reason(ReasonCode.ITERATION_LIMIT, data),)
     return "converged", (method.reason(ended),)
 
 

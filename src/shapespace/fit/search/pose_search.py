@@ -126,18 +126,16 @@ def rigid_search(
         R = _best_rotations(H - (total * scan_mean)[:, :, None] * model_mean[:, None])
         t = scan_mean - (R @ model_mean[:, :, None])[:, :, 0]
     _, _, forward, backward = _matches(R, t, model, scan, model_grid, scan_grid)
-    capped = (np.minimum(np.sqrt(squared), cap).mean(axis=1) for squared in (forward, backward))
-    return R, t, 0.5 * np.asarray(sum(capped))
+    score = sum(np.minimum(np.sqrt(squared), cap).mean(axis=1) for squared in (forward, backward))
+    return R, t, 0.5 * np.asarray(score)
 
 
 def _matches(
     R: FloatArray, t: FloatArray, model: FloatArray, scan: FloatArray, model_grid: NearGrid, scan_grid: NearGrid
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return scan points near to `model`, (S, 3, M), model points near to `scan`, (S, 3, N), squared distances."""
-    (y, forward), (x, backward) = (
-        scan_grid.look_up(R @ model.T + t[:, :, None]),
-        model_grid.look_up(R.transpose(0, 2, 1) @ (scan.T - t[:, :, None])),
-    )
+    y, forward = scan_grid.look_up(R @ model.T + t[:, :, None])
+    x, backward = model_grid.look_up(R.transpose(0, 2, 1) @ (scan.T - t[:, :, None]))
     return y, x, forward, backward
 
 
@@ -336,9 +334,8 @@ class _Sides:
         scan = np.array(scan_mm[np.random.default_rng(seed).permutation(_thin_evenly(scan_mm, cell, side.size))])
         # A surface crosses about 1.5 cells per squared edge, so the coarser count determines the area.
         spacing = 2 * cell * math.sqrt(len(_thin_evenly(scan, 2 * cell, side.size)) / 1.5 / len(scan))
-        return _Sides(
-            side, scan, KdTree(scan), np.array([1.5 * max(spacing, 0.5 * side.spacing), 1.2 * side.spacing]), with_scale
-        )
+        slack = np.array([1.5 * max(spacing, 0.5 * side.spacing), 1.2 * side.spacing])
+        return _Sides(side, scan, KdTree(scan), slack, with_scale)
 
     def upright(self) -> PoseCandidate:
         """Return the better of two poses without rotation: aligned centroids, or aligned outermost parts."""
