@@ -107,6 +107,11 @@ def test_forms_have_labels_and_help_for_readers_of_the_page(kind: str) -> None:
         assert option["label"][0].isupper()
 
 
+def test_texts_of_the_page_have_no_words_of_the_terminal() -> None:
+    texts = (SOURCE / "viewer" / "assets" / "studio-texts.js").read_text("utf-8")
+    assert TERMINAL.search(texts) is None and ".npz" not in texts and ".json" not in texts
+
+
 def test_a_page_without_forms_has_no_labels() -> None:
     assert "fit" in OptionLabels({}).sentence("run shapespace fit again")
 
