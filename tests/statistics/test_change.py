@@ -284,7 +284,7 @@ def fitted_pairs(subjects: int, stddev_mm: float, stated_mm: float) -> Cohort:
 def test_standard_deviations_of_fits_are_the_spread_that_their_coefficients_make() -> None:
     found = asked(fitted_pairs(150, 4.0, 4.0), stable="landmarks:back,100", permutations=1)
     assert found.uncertainty == "fits" and found.is_model_only
-    assert any("surfaces=dense" in note for note in analysis_report(found).notes)
+    assert any("fit with --dense" in note for note in analysis_report(found).notes)
     observed = np.sqrt(np.mean([one.change.along_mm**2 for one in found.subjects], axis=0))
     told = np.sqrt(np.mean([one.change.stddev_mm**2 for one in found.subjects], axis=0))
     largest = told > 0.3 * told.max()

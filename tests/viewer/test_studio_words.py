@@ -88,6 +88,7 @@ def test_no_message_has_words_of_the_terminal(text: str) -> None:
         ("shapespace compare: error: argument --set: gauge is 'x'", "The option “Size handling” is 'x'"),
         ("done\nnext: shapespace build x -o m.h5\n", "done\n"),
         ("Use --variances unequal.", "Use the option “Variances of classes”: unequal."),
+        ("model-2.h5: 3 modes, gauge shape", "model-2.h5: 3 modes, size handling: shape"),
         ("a dash -- as here, and 3--4 of them", "a dash -- as here, and 3--4 of them"),
     ],
 )  # fmt: skip
@@ -104,6 +105,15 @@ def test_forms_have_labels_and_help_for_readers_of_the_page(kind: str) -> None:
         words = f"{option['label']}. {option['help']}"
         assert TERMINAL.search(words) is None and FILES.search(words) is None, words
         assert option["label"][0].isupper()
+
+
+def test_texts_of_the_page_have_no_words_of_the_terminal() -> None:
+    texts = (SOURCE / "viewer" / "assets" / "studio-texts.js").read_text("utf-8")
+    assert TERMINAL.search(texts) is None and ".npz" not in texts and ".json" not in texts
+
+
+def test_a_page_without_forms_has_no_labels() -> None:
+    assert "fit" in OptionLabels({}).sentence("run shapespace fit again")
 
 
 def test_pages_have_labels_in_their_text_and_commands_as_they_are() -> None:

@@ -157,8 +157,8 @@ _EXECUTION_SETTINGS = (
             "a Dask cluster", EXECUTION, "kind", choices=("local", "serial", "dask")),
     setting("dask", "ADDRESS", "address of a Dask scheduler, such as tcp://10.0.0.5:8786, or its scheduler file "
             "(.json); without it executor=dask starts a cluster on this machine", EXECUTION),
-    setting("timeout", "S", "skip scans, fits or folds that take longer than S seconds (default: no limit)",
-            EXECUTION, "timeout_s", parse=values.seconds),
+    setting("timeout", "S", "time limit of a scan, fit or fold, s; those that take longer are skipped (default: no "
+            "limit)", EXECUTION, "timeout_s", parse=values.seconds),
 )  # fmt: skip
 
 

@@ -58,8 +58,8 @@ class BuildFilesConfig:
         min_seen: remove vertices that fewer than this share of the meshes show, with their triangles and landmarks;
             missing vertices are nan in the files (default: 0.5).
         landmarks: landmarks of the model: points on the first mesh in any landmark format, a CSV of name,vertex, or
-            `landmarks.csv` of correspond (default: landmarks.csv next to the first mesh, otherwise those of the model
-            of fitted surfaces).
+            `landmarks.csv` of a correspondence (default: landmarks.csv next to the first mesh, otherwise those of the
+            model of fitted surfaces).
         regions: name -> file with the vertices of this region of the meshes. The model stores the regions, and fits can
             be restricted to a region.
         labels: separate identity and expression: CSV of file, subject and label, with a neutral face of each subject;

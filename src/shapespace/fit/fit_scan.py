@@ -142,8 +142,8 @@ class FitConfig:
         modes: number of coefficients to report, from the first; None for all. The robust method fits all modes in any
             case; the paper's method fits only these.
         unit: unit of the scan; `auto` detects it from its size.
-        scale: `free` estimates the scale, `fixed` keeps it; `auto`: free if the model's gauge is shape, fixed if it is
-            form.
+        scale: `free` estimates the scale, `fixed` keeps it; `auto`: free if size is divided out of the model,
+            fixed if size is kept.
         max_iterations: maximum number of iterations of each phase.
         seed: seed of the random subsample of the pose search.
         landmark_stddev_mm: standard deviation of the landmarks in mm of the scan (default: 3 % of the model's size, the

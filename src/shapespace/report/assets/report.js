@@ -145,7 +145,9 @@
   // The navigation marks the part that is read.
   const links = Array.from(document.querySelectorAll("nav a"));
   function tellWhere() {
-    const below = links.findIndex((link) => document.getElementById(link.hash.slice(1)).getBoundingClientRect().top > 120);
+    const height = links.length ? links[0].closest("nav").offsetHeight : 0;
+    document.documentElement.style.scrollPaddingTop = `${height + 14}px`;
+    const below = links.findIndex((link) => document.getElementById(link.hash.slice(1)).getBoundingClientRect().top > height + 74);
     const end = window.innerHeight + window.scrollY >= document.documentElement.scrollHeight - 4;
     const at = end || below < 0 ? links.length - 1 : Math.max(0, below - 1);
     links.forEach((link, k) => {
@@ -154,6 +156,7 @@
       if (k !== at) return;
       const list = link.closest("ul");
       list.scrollLeft += link.getBoundingClientRect().left - list.getBoundingClientRect().left - 60;
+      list.scrollTop += link.getBoundingClientRect().top - list.getBoundingClientRect().top - 46; // of two rows
     });
   }
   window.addEventListener("scroll", tellWhere, { passive: true });

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias, TypeVar
 
 from shapespace.report.blocks.wording import DASH, STATUS_WORDS, counted, isfinite, mm, setting, words
+
+_MOST_ADDED = 3
+"""Decimals that a number of a column may get beyond its own, so that very different numbers stay readable."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +88,11 @@ class Table:
     def long(self) -> bool:
         """Whether the table has so many rows that they scroll below fixed column heads."""
         return len(self.rows) > self.MOST_OPEN
+
+    @property
+    def aligned_rows(self) -> Sequence[Sequence[Cell]]:
+        """The rows, with equal decimals of the numbers of a column."""
+        return list(zip(*map(_with_equal_decimals, zip(*self.rows, strict=True)), strict=True))
 
 
 @dataclass(frozen=True)
@@ -272,6 +280,23 @@ def no_picture(count: int, noun: str) -> Text:
     """Return a sentence on the number of results without a card in a gallery."""
     others = f"{counted(count, f'other {noun}')} have no picture here"
     return Text(f"{others}, so that this file stays below 8 MB; the table has them all." if count else "")
+
+
+def _with_equal_decimals(column: Sequence[Cell]) -> Sequence[Cell]:
+    """Return the cells of a column; those of numbers get the most decimals of a cell."""
+    own = [len(cell.text.partition(".")[2]) for cell in column]
+    numeric = [
+        cell.value is not None and f"{cell.value:,.{k}f}" == cell.text.replace("−", "-")
+        for cell, k in zip(column, own, strict=True)
+    ]
+    decimals = [k for k, is_number in zip(own, numeric, strict=True) if is_number] or [0]
+    most = min(max(decimals), min(decimals) + _MOST_ADDED)
+    return [
+        replace(cell, text=f"{cell.value or 0:,.{most}f}".replace("-", cell.text[0]))
+        if is_number and k < most
+        else cell
+        for cell, k, is_number in zip(column, own, numeric, strict=True)
+    ]
 
 
 def number(value: float, digits: int = 2) -> Cell:

@@ -694,12 +694,11 @@ def settings_blocks(configs: Sequence[Mapping[str, Any]], first: Sequence[tuple[
 
 def described(cls: type) -> dict[str, str]:
     """Return the description of each argument of a class, from its docstring."""
-    entries = re.findall(
-        r"^    (\w+): (.*(?:\n        .*)*)",
-        (inspect.getdoc(cls) or "").partition("Args:\n")[2].partition("\n\n")[0],
-        re.MULTILINE,
-    )
-    return {name: " ".join(text.split()).strip(" ,;") for name, text in entries}
+    arguments = (inspect.getdoc(cls) or "").partition("Args:\n")[2].partition("\n\n")[0]
+    return {
+        name: " ".join(text.split()).strip(" ,;")
+        for name, text in re.findall(r"^    (\w+): (.*(?:\n        .*)*)", arguments, re.MULTILINE)
+    }
 
 
 def _numbers(key: str, values: Mapping[str, Any], part_name: str) -> list[Block]:
@@ -719,9 +718,8 @@ def _numbers(key: str, values: Mapping[str, Any], part_name: str) -> list[Block]
 
 
 def _level(name: str, value: object) -> str:
-    if name == "triangles":
-        return "triangles" if value else "vertices"
-    return f"{value:,}" if isinstance(value, int) else plain(value)
+    kind = "triangles" if value else "vertices"
+    return kind if name == "triangles" else f"{value:,}" if isinstance(value, int) else plain(value)
 
 
 def _flat(key: str, values: Mapping[str, Any]) -> list[tuple[str, object]]:
@@ -744,13 +742,11 @@ def _list(value: object) -> list[object]:
 
 
 def _modes(config: Mapping[str, Any]) -> str:
-    modes = config.get("modes")
-    return "all of the model" if modes is None else f"the first {plain(modes)}"
+    return "all of the model" if (modes := config.get("modes")) is None else f"the first {plain(modes)}"
 
 
 def _unit(config: Mapping[str, Any]) -> str:
-    unit = plain(config.get("unit"))
-    return "found from the size of each scan" if unit == "auto" else f"{unit}, as given"
+    return "found from the size of each scan" if (unit := plain(config.get("unit"))) == "auto" else f"{unit}, as given"
 
 
 def _scale(config: Mapping[str, Any]) -> str:

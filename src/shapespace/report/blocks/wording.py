@@ -65,16 +65,13 @@ def mm(value: float) -> str:
     """Return a length with three or so digits and its unit."""
     if not isfinite(value):
         return DASH
-    digits = 0 if abs(value) >= 99.95 else 1 if abs(value) >= 9.995 else 2
-    return f"{value:.{digits}f} mm".replace("-", "−")
+    return f"{value:.{(abs(value) < 99.95) + (abs(value) < 9.995)}f} mm".replace("-", "−")
 
 
 def percent(share: float) -> str:
     """Return a percentage that is 100 only for a share of 1, and 0 only for a share of 0."""
-    if not isfinite(share):
-        return DASH
-    if 0.0 < share < 0.01:
-        return f"{max(100 * share, 0.1):.1f} %"
+    if not isfinite(share) or 0.0 < share < 0.01:
+        return f"{max(100 * share, 0.1):.1f} %" if isfinite(share) else DASH
     return f"{min(100 * share, 99.9):.1f} %" if 0.99 < share < 1.0 else f"{100 * share:.0f} %"
 
 

@@ -435,18 +435,15 @@ def _times_sentence(times: float) -> str:
 def _cell(value: object, column: TableColumn, parts_file: PartsFile) -> Cell:
     """Return a cell of a table by the kind of its column."""
     where = f"{parts_file.file}: the column {column.name!r}"
-    if column.kind == "text":
-        return Cell(DASH if value in (None, "") else str(value))
-    if value is None:
-        return Cell(DASH, float("nan"))
+    if column.kind == "text" or value is None:
+        return Cell(DASH if value in (None, "") else str(value), None if column.kind == "text" else float("nan"))
     if column.kind == "interval":
         low, high = read(tuple[float, float], value, where, parts_file.again)
         return Cell(f"{100 * low:.1f} to {100 * high:.1f} %", low)
     number = read(float, value, where, parts_file.again)
-    if column.kind == "mm":
-        return length(number)
     return Cell(
         {
+            "mm": length(number).text,
             "percent": f"{100 * number:.1f} %",
             "p": "< 0.001" if number < 0.001 else f"{number:.3f}",
             "count": f"{number:,.0f}",

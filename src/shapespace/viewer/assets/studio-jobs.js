@@ -53,8 +53,7 @@
     const { flag, kind, choices, initial, required } = option;
     const label = html`<span>${option.label}${required && html` <small>(${J.required})</small>`}</span>`;
     const common = { "data-testid": `option${flag}`, "aria-describedby": `help${flag}`, required };
-    // The field shows the default already.
-    const text = option.help.replace(/\s*\(default: [^()]*\)\s*$/, "");
+    const text = option.help.replace(` (default: ${initial})`, ""); // the field shows it already
     const help = html`<${Help} id=${`help${flag}`} text=${text} />`;
     if (kind === "formula") return html`<${Formula} option=${option} value=${value || ""} columns=${columns} onvalue=${onvalue} />`;
     if (kind === "flag") return html`<div class="option"><label class="check"><input type="checkbox" ...${common} checked=${value === true} onchange=${(event) => onvalue(event.target.checked)} />${option.label}</label>${help}</div>`;

@@ -73,13 +73,13 @@
           <${CopyButton} strong text=${history} label=${H.copy} testid="copy-commands" /></div>
         ${!project.jobs.length ? html`<p class="hint">${H.none}</p>` : html`
           <div class="table-box" role="region" aria-label=${H.title} tabindex="0"><table class="plain" data-testid="history">
-            <thead><tr><th scope="col" class="number">${H.number}</th><th scope="col">${H.action}</th><th scope="col">${H.status}</th><th scope="col">${H.time}</th><th scope="col">${H.command}</th></tr></thead>
+            <thead><tr><th scope="col" class="number">${H.number}</th><th scope="col">${H.action}</th><th scope="col">${H.status}</th><th scope="col" class="number">${H.time}</th><th scope="col">${H.command}</th></tr></thead>
             <tbody>${[...project.jobs].reverse().map((job) => html`
               <tr key=${job.number} class=${job.status} data-testid=${`history-${job.number}`}>
                 <td class="number">${job.number}</td>
                 <th scope="row"><button type="button" class="small" aria-expanded=${open === job.number} data-testid=${`details-${job.number}`} onclick=${() => setOpen(open === job.number ? null : job.number)}>${Studio.kindOf(job)}</button></th>
                 <td class="short"><span class="dot" aria-hidden="true"></span> ${T.jobs.statuses[job.status]}</td>
-                <td class="short">${job.seconds ? Studio.duration(job.seconds) : ""}</td>
+                <td class="number short">${job.seconds ? Studio.duration(job.seconds) : ""}</td>
                 <td><code>${job.command}</code>${open === job.number && html`<${JobPanel} job=${job} />`}</td>
               </tr>`)}</tbody></table></div>`}
       </div>`;

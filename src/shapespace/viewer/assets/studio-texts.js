@@ -95,14 +95,14 @@
     correspondence: {
       title: "Correspondence", intro: (number) => `${count(number, "included specimen")} for training. Each gets the same vertices, so that shapes can be compared.`,
       redoTitle: "Correct one scan", redoHint: "Does one surface not match its scan? Redo only that one; all others stay as they are.", redoWhich: "Scan", redo: "Redo this one",
-      landmarksTitle: "Landmarks", landmarksHint: "Click a place on any surface to mark the same vertex on all, then name it. Drag a landmark on one surface to move it on all. Commands use the names.",
+      landmarksTitle: "Landmarks", landmarksHint: "Click a place on any surface to mark the same vertex on all, then name it. Drag a landmark on one surface to move it on all. Analyses use the names.",
       landmark: "Name", vertex: "Vertex", landmarksElsewhere: (output) => `The landmarks of this project were placed on ${output}, whose vertices are others; those that you add here replace them.`, vertexOf: (name) => `Vertex of ${name}`, addLandmark: "Add", removeLandmark: (name) => `Remove the landmark ${name}`, noLandmarks: "None yet.",
       none: "Add specimens first; correspondence needs at least two.", empty: "After the run, all surfaces turn here together: check that the checkerboard lies the same way on each.",
     },
     model: { title: "Model", intro: "Mean shape and modes of variation of the surfaces in correspondence.", empty: "After the run, the model with a slider per mode is shown here.", none: "Bring the specimens into correspondence first." },
     fit: {
       title: "Fit", intro: "Fit the model to scans that it was not built from.", drop: "Drop new scans here", scans: (number) => `${count(number, "new scan")} to fit`,
-      empty: "After the run, each fit is shown here with its verdict, distances and position among the training set.", none: "Build a model first.", report: "Write report of the fits",
+      empty: "After the run, each fit is shown here with its status, distances and position among the training set.", none: "Build a model first.", report: "Write report of the fits",
     },
     questions: {
       title: "What do you want to know?", all: "All questions", earlier: "Earlier results", columns: "Columns", formula: "Formula", size: "size of the shapes", noColumns: "The table has no columns yet; add some under Specimens.",

@@ -26,7 +26,7 @@
       if (/\.csv$/i.test(file.name)) await compareTab.readCsv(file);
       else if (!suits(file.name)) refused.push(`${file.name} is not a scan that can be read; drop ${about.formats.join(", ")}.`);
       else if (file.size > about.upload_bytes) {
-        refused.push(`${file.name} is larger than the ${maxMegabytes()} MB that this viewer takes; thin it, or start the viewer with a larger --max-upload-mb.`);
+        refused.push(`${file.name} is larger than the ${maxMegabytes()} MB that this viewer takes; thin it${window.parent === window ? ", or start the viewer with a larger --max-upload-mb" : ""}.`);
       } else if (taken.length < about.kept) taken.push(file);
       else refused.push(`${file.name} is not sent, because at most ${about.kept} scans are kept; drop fewer at a time.`);
     }

@@ -36,6 +36,7 @@ _TERMINAL_NOTES = re.compile(
 """Parts for the terminal alone: names of result files in parentheses, exit codes, usage, and the next command."""
 _ERROR = re.compile(r"shapespace [a-z ]+: error: (?:argument (?:-\w/)?(?:(--set|--[\w-]+(?=: must)):)?)?")
 """The beginning of a message on an option with a wrong value."""
+_GAUGE = re.compile(r"(?<!the )\bgauge (?=(?:form|shape)\b)")
 _OPTION = re.compile(
     r"(?P<quantity>\b(?:fewer|more|smaller|larger|such an?) (?!\())?(?P<parenthesis>\()?--(?P<name>set \w+|[a-z][\w-]*)"
     r"(?: \([a-z]+_[a-z_]+\))?(?:(?P<equals>[ =])(?P<word>(?!out\b)\w[\w.,=-]*(?<![.,])))?(?P<end>(?=[.;:,)<\"\n]|$))?"
@@ -68,7 +69,7 @@ class OptionLabels:
         text = _ERROR.sub(r"\1", _TERMINAL_NOTES.sub("", text))
         names = self._actions
         text = self._action.sub(lambda at: f"“{names[at[1] or at[2]]}”{' and ' if at[3] else ''}", text)
-        return _OPTION.sub(self._label, text)
+        return _OPTION.sub(self._label, _GAUGE.sub("size handling: ", text))
 
     def page(self, html: str) -> str:
         """Return an HTML page with labels in its text, but not in its commands."""
@@ -260,8 +261,7 @@ def checks(
     drop_missing = options.get("--missing") == "drop"
     if drop_missing:
         chosen = [specimen for specimen in chosen if all(specimen.cells.get(column) for column in columns)]
-    take = "specimen takes" if len(chosen) == 1 else "specimens take"
-    found = [{"level": "ok" if len(chosen) >= 2 else "problem", "text": f"{len(chosen)} {take} part."}]
+    found = [{"level": "ok" if len(chosen) >= 2 else "problem", "text": f"Included specimens: {len(chosen)}."}]
     if kind == "score" and options.get("--reference"):
         members, others = map(len, _by_class(chosen, options["--reference"]))
         level = "problem" if members < 2 or not others else "warning" if members < 20 else "ok"
