@@ -71,7 +71,7 @@ def test_a_report_of_a_study_has_a_chapter_for_each_result(template: Path, tmp_p
     answer.save(tmp_path / "morphospace")
     write_rows(tmp_path / "table.csv", ("specimen", "sex"), [(name, "fm"[k % 2]) for k, name in enumerate(NAMES)])
     results = [template, tmp_path / "model.h5", tmp_path / "morphospace"]
-    page = write_study_report(results, tmp_path / "r.html", specimens=tmp_path / "table.csv").read_text("utf-8")
+    page = write_study_report(results, tmp_path / "new" / "r.html", specimens=tmp_path / "table.csv").read_text("utf-8")
     assert "This part could not be made" not in page and EVIL not in page
     seen = Page(page)
     chapters = ["Specimens", "Answers", "Correspondence of 7 scans in same", "The same places on every scan"]

@@ -58,7 +58,7 @@ _ACTIONS: Mapping[str, str] = {
     "identify": "Who is it?", "report": "Report", "convert": "Convert the model", "export": "Export",
     "disparity": "Which group varies more?", "equality": "Do groups differ in mean or variation?",
     "equivalence": "Are groups practically the same?", "power": "How many specimens are needed?",
-    "discriminant": "Can groups be told apart?", "pairwise": "Which pairs of groups differ?",
+    "discriminant": "Can groups be distinguished?", "pairwise": "Which pairs of groups differ?",
     "trajectory": "Do groups change in the same way?", "allometry": "Does shape depend on size?",
     "repeatability": "How repeatable is the measurement?", "pls": "Does shape vary with several measurements?",
     "integration": "Do parts vary together?", "modularity": "Are parts independent modules?",

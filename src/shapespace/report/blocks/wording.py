@@ -65,7 +65,8 @@ def mm(value: float) -> str:
     """Return a length with three or so digits and its unit."""
     if not isfinite(value):
         return DASH
-    return f"{value:.{(abs(value) < 99.95) + (abs(value) < 9.995)}f} mm".replace("-", "−")
+    digits = 0 if abs(value) >= 99.95 else 1 if abs(value) >= 9.995 else 2
+    return f"{value:.{digits}f} mm".replace("-", "−")
 
 
 def percent(share: float) -> str:

@@ -237,6 +237,7 @@ def write_study_report(
         ShapespaceError: the extra `report` is not installed.
     """
     require_report_extra()
+    make_folder(output.parent)  # before the pictures, which take long
     page = _StudyPage(on_step)
     table = None if specimens is None else read_table(specimens)
     for result in results:

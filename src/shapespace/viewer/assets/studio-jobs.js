@@ -14,6 +14,10 @@
   const action = (kind) => (Studio.forms[kind] ? Studio.forms[kind].label : J.kinds[kind] || kind);
   const kindOf = (job) => action(job.kind);
 
+  const NAMED_BY = ["--formula", "--target", "--along", "--group", "--subject", "--time", "--reference"]; // options that name a run
+  const titleOf = (job) => J.title(job.number, NAMED_BY.map((flag) => job.options[flag]).filter(Boolean).join(", ") || job.output || job.kind);
+
+  Studio.titleOf = titleOf;
   Studio.fileAddress = (path) => `/files/${path.split("/").map(encodeURIComponent).join("/")}`;
 
   // Forms -----------------------------------------------------------------------------------------------------------
@@ -116,7 +120,7 @@
     return html`
       <form class="job-form" data-testid=${`form-${kind}`} onsubmit=${run} novalidate>
         ${possible.length > 1 && html`<label class="option"><span>${J.source}</span><select data-testid="source" value=${on} onchange=${(event) => setOn(event.target.value)}>
-          <option value="">${J.newest}</option>${possible.map((job) => html`<option key=${job.number} value=${job.number}>${J.title(job)}</option>`)}</select></label>`}
+          <option value="">${J.newest}</option>${possible.map((job) => html`<option key=${job.number} value=${job.number}>${titleOf(job)}</option>`)}</select></label>`}
         ${form.options.filter((option) => option.visible).map(show)}
         ${folded.length > 0 && html`<details data-testid="more-options"><summary>${J.more(folded.length)}</summary>${folded.map(show)}</details>`}
         ${children}
@@ -218,7 +222,7 @@
     const select = job && html`
       <div class="row bar result-bar">
         ${finished.length > 1 ? html`<label>${J.result} <select data-testid="result" value=${job.number} onchange=${(event) => setChosen(Number(event.target.value))}>
-          ${finished.map((one) => html`<option key=${one.number} value=${one.number} selected=${one === job}>${kindOf(one)}, ${J.title(one)}</option>`)}</select></label>` : html`<strong>${kindOf(job)}</strong>`}
+          ${finished.map((one) => html`<option key=${one.number} value=${one.number} selected=${one === job}>${kindOf(one)}, ${titleOf(one)}</option>`)}</select></label>` : html`<strong>${kindOf(job)}</strong>`}
         <span class="grow"></span>
         ${job.views.length > 0 && html`<a href=${job.views[0].href} target="_blank" rel="noopener" data-testid="open-result">${J.full}</a>`}
         <${Outdated} job=${job} />

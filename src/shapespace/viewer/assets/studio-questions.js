@@ -51,7 +51,7 @@
         </ul>
         ${earlier.length > 0 && html`<h3>${Q.earlier}</h3>
           <ul class="recent">${earlier.map((job) => html`<li key=${job.number}><button type="button" data-testid=${`earlier-${job.number}`} onclick=${() => setQuestion({ kind: job.kind, first: job.number })}>
-            <strong>${Studio.kindOf(job)}</strong><span>${T.jobs.title(job)}${job.outdated ? html` <span class="tag">${T.jobs.isOutdated}</span>` : ""}</span><span class="hint">${T.jobs.statuses[job.status]}${job.sentences.length ? `: ${job.sentences[0]}` : ""}</span></button></li>`)}</ul>`}
+            <strong>${Studio.kindOf(job)}</strong><span>${Studio.titleOf(job)}${job.outdated ? html` <span class="tag">${T.jobs.isOutdated}</span>` : ""}</span><span class="hint">${T.jobs.statuses[job.status]}${job.sentences.length ? `: ${job.sentences[0]}` : ""}</span></button></li>`)}</ul>`}
       </div>`;
   };
 })();

@@ -30,7 +30,7 @@
     const isQuestion = Studio.QUESTIONS.includes(job.kind);
     return html`
       <tr data-testid=${`export-${job.number}`}>
-        <th scope="row"><strong>${Studio.kindOf(job)}</strong>${job.outdated && html` <span class="tag">${T.jobs.isOutdated}</span>`}<span class="hint">${T.jobs.title(job)}</span></th>
+        <th scope="row"><strong>${Studio.kindOf(job)}</strong>${job.outdated && html` <span class="tag">${T.jobs.isOutdated}</span>`}<span class="hint">${Studio.titleOf(job)}</span></th>
         <td><${Files} job=${job} /></td>
         <td><div class="row">
           <a class="button" href=${`/zip/${job.number}`} download data-testid=${`zip-${job.number}`}>${T.export.zip}</a>

@@ -4,8 +4,6 @@
 
   const count = (number, one, many) => `${number.toLocaleString("en")} ${number === 1 ? one : many || `${one}s`}`;
 
-  const NAMED_BY = ["--formula", "--target", "--along", "--group", "--subject", "--time", "--reference"]; // options that name a run
-
   window.ShapespaceTexts = {
     count,
     offline: "The studio's server does not answer; check that shapespace studio still runs. This page continues when it is back.",
@@ -81,7 +79,7 @@
       settings: "Settings, and run again", run: "Run", runAgain: "Run again", runOf: { correspond: "Bring into correspondence", build: "Build the model", fit: "Fit the scans" },
       more: (number) => `${count(number, "more option")}`, cancel: "Cancel", continue: "Continue", log: "Log", command: "Command", copy: "Copy", copied: "Copied",
       noLog: "The log is empty.", result: "Result", noResult: "Results appear here.", required: "required", yes: "yes", none: "(none)", default: "(default)",
-      title: (job) => `${job.number}: ${NAMED_BY.map((flag) => job.options[flag]).filter(Boolean).join(", ") || job.output || job.kind}`,
+      title: (number, name) => `${number}: ${name}`,
       sameSettings: "Run again with the same settings", isOutdated: "outdated",
       outdated: {
         specimens: "Made before specimens were changed, excluded or included.", table: "Made before the table was changed.", landmarks: "Made before the landmarks were changed.",
