@@ -18,7 +18,7 @@ from tempfile import TemporaryDirectory
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from shapespace.batch.workers import preload, start_loading
+from shapespace.batch.workers import context, interrupts_ignored, preload, start_loading
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.schemas import CorrespondenceRecord
 
@@ -75,8 +75,9 @@ def serve(
     require_view_extra()
     has_surfaces, is_project = (path / CorrespondenceRecord.FILE).is_file(), _is_project(path)
     if (has_surfaces or is_project) and model is not None:
-        what = "a correspondence" if has_surfaces else "a project"
-        raise InputError(f"{path} is {what} without fits; leave --model out.")
+        raise InputError(
+            f"{path} is {'a correspondence' if has_surfaces else 'a project'} without fits; leave --model out."
+        )
     if is_project:
         serve_studio(
             path, {}, host=host, port=port, open_browser=open_browser, max_upload_mb=max_upload_mb, read_only=True,
@@ -136,17 +137,23 @@ def serve_studio(
         preload(("shapespace.viewer.studio.specimen_checks",))
     from shapespace.report.pages.write_html import require_report_extra
     from shapespace.viewer.studio.app import Studio, make_studio
+    from shapespace.viewer.studio.specimen_checks import compile_fits
 
     require_report_extra()
     with _end_by_signals(), ExitStack() as stack:
         studio = Studio(forms, project, max_upload_mb * 2**20, read_only=read_only)
         stack.callback(studio.close)
-        what = "viewer" if read_only else "studio"
+        if not read_only:
+            with interrupts_ignored():
+                context().Process(target=compile_fits, name=compile_fits.__name__, daemon=True).start()
 
         def started(server: uvicorn.Server) -> None:
             studio.ends = lambda: server.should_exit
 
-        _run(partial(make_studio, studio), what, host, port, open_browser=open_browser, started=started, say=say)
+        _run(
+            partial(make_studio, studio), "viewer" if read_only else "studio", host, port, open_browser=open_browser,
+            started=started, say=say,
+        )  # fmt: skip
 
 
 def _is_project(path: Path) -> bool:
@@ -177,8 +184,9 @@ def _run(
             say(f"Anyone with this address can use the {what}, and the connection is not encrypted.")
         say(f"Ctrl-C ends the {what}.")
         if open_browser:
-            address = page_address(host, port, access.new_ticket())
-            threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
+            threading.Thread(
+                target=webbrowser.open, args=(page_address(host, port, access.new_ticket()),), daemon=True
+            ).start()
 
         def is_running(_: logging.LogRecord) -> bool:
             return not server.should_exit
@@ -241,10 +249,8 @@ def listen(host: str, port: int | None) -> socket.socket:
     Raises:
         InputError: the port is taken or not allowed, or the host is not an address of this machine.
     """
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    ports = range(FIRST_PORT, FIRST_PORT + _PORTS_TRIED) if port is None else [port]
-    for candidate in ports:
-        listener = socket.socket(family)
+    for candidate in range(FIRST_PORT, FIRST_PORT + _PORTS_TRIED) if port is None else [port]:
+        listener = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
         try:
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.bind((host, candidate))
@@ -266,6 +272,4 @@ def listen(host: str, port: int | None) -> socket.socket:
 def page_address(host: str, port: int, token: str) -> str:
     """Return the address of the page with a token or ticket."""
     name = socket.gethostname() if host in _ALL_INTERFACES else host
-    if ":" in name:
-        name = f"[{name}]"
-    return f"http://{name}:{port}/?token={token}"
+    return f"http://{f'[{name}]' if ':' in name else name}:{port}/?token={token}"

@@ -93,8 +93,11 @@ class SpecimenChecks:
 
     def _processes(self) -> ProcessPoolExecutor:
         if self._pool is None:
-            processes = min(_MOST_PROCESSES, max(1, (os.cpu_count() or 2) - 1))
-            self._pool = ProcessPoolExecutor(processes, mp_context=context(), initializer=_start_process)
+            self._pool = ProcessPoolExecutor(
+                min(_MOST_PROCESSES, max(1, (os.cpu_count() or 2) - 1)),
+                mp_context=context(),
+                initializer=_start_process,
+            )
         return self._pool
 
     def _facts_of_failure(self, error: BaseException | None) -> dict[str, Any]:
@@ -110,6 +113,14 @@ def _start_process() -> None:
     lower_priority()
     if (server := multiprocessing.parent_process()) is not None:
         end_after(server.join)
+
+
+def compile_fits() -> None:
+    """Compile the code of a fit, unless it is compiled, so that the first fit does not wait for it."""
+    _start_process()
+    from shapespace.batch.warm import warm_up  # loads the code of a fit
+
+    warm_up(notify=False)
 
 
 def _load_code() -> None:
