@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from shapespace.batch.executors import ExecutionConfig
@@ -92,9 +93,8 @@ class _Clock:
         self.bar.update()
 
     def lap(self, part: str) -> None:
-        now = time.perf_counter()
-        self.seconds[part] = now - self._since
-        self._since = now
+        before, self._since = self._since, time.perf_counter()
+        self.seconds[part] = self._since - before
 
 
 def run_demo(folder: Path, *, quick: bool = False, quiet: bool = False, scale: DemoScale | None = None) -> Path:
@@ -116,7 +116,8 @@ def run_demo(folder: Path, *, quick: bool = False, quiet: bool = False, scale: D
     for part in ("experiment1", "experiment2"):
         shutil.rmtree(folder / part, ignore_errors=True)
     clock = _Clock(17 + 4 + 4 + 3, quiet=quiet)
-    with clock.bar:
+    # Its products are short, so that more threads take twice as long, and their number would change last digits.
+    with clock.bar, threadpool_limits(1, user_api="blas"):
         faces = load_faces()
         first = _experiment_1(folder, faces, scale, clock)
         clock.lap("experiment1")

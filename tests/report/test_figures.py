@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.image import BboxImage
 from PIL import Image
 
 from shapespace.errors import InputError
@@ -71,7 +72,7 @@ def words(figure: Figure) -> str:
 
 
 def pictures(figure: Figure) -> list[np.ndarray]:
-    return [np.asarray(axes.images[0].get_array()) for axes in figure.axes if axes.images]
+    return [np.asarray(panel.get_array()) for panel in figure.artists if isinstance(panel, BboxImage)]
 
 
 OF_ONE_FIT = [
@@ -563,12 +564,13 @@ def test_coefficients_that_do_not_go_together_are_refused() -> None:
 
 def test_pictures_are_shown_pixel_for_pixel(head: MakeHead) -> None:
     figure = figures.faces_grid([head(6)] * 5, list("abcde"), title="t", columns=3)
-    assert len(figure.axes) == 5
-    for axes in figure.axes:
-        box, image = axes.get_position(), axes.images[0].get_array()
-        shown = (box.height * figure.get_figheight() * figure.dpi, box.width * figure.get_figwidth() * figure.dpi)
-        np.testing.assert_allclose(shown, image.shape[:2], atol=0.01)
-        top = (1 - box.y1) * figure.get_figheight() * figure.dpi
+    panels = figure.findobj(BboxImage)
+    assert len(panels) == 5
+    for panel in panels:
+        assert isinstance(panel, BboxImage)
+        box, image = panel.get_window_extent(), np.asarray(panel.get_array())
+        np.testing.assert_allclose((box.height, box.width), image.shape[:2], atol=0.01)
+        top = figure.bbox.height - box.y1
         assert top == pytest.approx(round(top), abs=0.01)
 
 

@@ -13,6 +13,7 @@ import pytest
 from fontTools.ttLib import TTFont
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.image import BboxImage
 from matplotlib.text import Text
 from PIL import Image
 
@@ -69,9 +70,10 @@ def test_surfaces_have_the_resolution_of_the_file(tmp_path: Path, head: Callable
     mesh = head(6)
     with figures.publication_style(200):
         figure = figures.surface_map_figure(mesh, mesh.vertices[:, 1], unit="mm")
-    panel = figure.axes[0]
-    inches = panel.get_position().width * float(figure.get_figwidth())
-    assert np.asarray(panel.images[0].get_array()).shape[1] == pytest.approx(200 * inches, abs=1.5)
+    panel = figure.findobj(BboxImage)[0]
+    assert isinstance(panel, BboxImage)
+    inches = panel.get_window_extent().width / figure.dpi
+    assert np.asarray(panel.get_array()).shape[1] == pytest.approx(200 * inches, abs=1.5)
     [path] = figures.save_figure(figure, tmp_path / "map", ["png"], 200)
     with Image.open(path) as image:
         assert image.size[0] == pytest.approx(200 * TWO_COLUMNS_MM / 25.4, abs=2)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.image import BboxImage
 from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -42,7 +43,7 @@ def still_life() -> dict[str, np.ndarray]:
         "overlay": [Layer(surface, SCAN_COLOUR), Layer(mean, MODEL_COLOUR)],
     }
     made = dict(zip(layers, render_series(list(layers.values()), camera=camera, size=SIZE), strict=True))
-    panels = [np.asarray(a.images[0].get_array()) for a in figures.modes_figure(model, 2).axes if a.images]
+    panels = [np.asarray(panel.get_array()) for panel in figures.modes_figure(model, 2).findobj(BboxImage)]
     made["modes"] = np.concatenate([np.concatenate(panels[k : k + 4], axis=1)[::4, ::4] for k in (0, 4)])
     return made
 

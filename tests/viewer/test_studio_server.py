@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from io import BytesIO
+from multiprocessing import active_children
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +22,12 @@ from viewer_world import enter, sentence, served, unpacked
 from shapespace.cli.command_table import summaries_and_options
 from shapespace.cli.forms import forms
 from shapespace.errors import FileError
+from shapespace.viewer import serve
 from shapespace.viewer.guard import Access
 from shapespace.viewer.studio import run_job
 from shapespace.viewer.studio.app import Studio, make_studio
 from shapespace.viewer.studio.jobs import Jobs, Order
+from shapespace.viewer.studio.specimen_checks import compile_fits
 
 FORMS = forms(summaries_and_options())
 
@@ -65,6 +69,24 @@ def upload(client: httpx.Client, tmp_path: Path, count: int, role: str = "traini
         scan = tetrahedron(tmp_path / f"s{k}.ply", 1.0 + k)
         answer = client.put("/api/specimens", params={"name": scan.name, "set": role}, content=scan.read_bytes())
         assert answer.status_code == 201, answer.text
+
+
+@pytest.mark.parametrize("read_only", [False, True])
+def test_the_studio_compiles_the_code_of_a_fit_while_scans_are_dropped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read_only: bool
+) -> None:
+    with studio(tmp_path / "p"):
+        pass
+    compilers: list[BaseProcess] = []
+
+    def run(*_: object, **__: object) -> None:
+        compilers.extend(process for process in active_children() if process.name == compile_fits.__name__)
+
+    monkeypatch.setattr(serve, "_run", run)
+    serve.serve_studio(tmp_path / "p", FORMS, read_only=read_only)
+    for process in compilers:
+        process.join(300)
+    assert [process.exitcode for process in compilers] == ([] if read_only else [0])
 
 
 def test_dropped_scans_are_checked_pictured_and_listed(tmp_path: Path) -> None:

@@ -371,10 +371,10 @@ class ShapeModel:
         if len(vertices) == self.n_vertices + len(self.dropped_vertices):
             vertices = np.delete(vertices, self.dropped_vertices, axis=0)
         if len(vertices) != self.n_vertices:
-            name = shape.name if isinstance(shape, Mesh) else "The shape"
             raise CorrespondenceError(
-                f"{name} has {len(vertices)} vertices but the model has {self.n_vertices}; only shapes in the "
-                "model's vertex order can be projected; fit this mesh instead (shapespace fit, or fit_scan)."
+                f"{shape.name if isinstance(shape, Mesh) else 'The shape'} has {len(vertices)} vertices but the model "
+                f"has {self.n_vertices}; only shapes in the model's vertex order can be projected; fit this mesh "
+                "instead (shapespace fit, or fit_scan)."
             )
         is_observed: BoolArray = ~np.logical_or.reduce(np.isnan(vertices), axis=1)
         if np.isinf(vertices).any() or is_observed.sum() < _FEWEST_OBSERVED:
@@ -382,9 +382,10 @@ class ShapeModel:
         if not align:
             return self.nearest(vertices)
         b, Q = np.zeros(self.n_modes), self.mean_vertices
+        used = slice(None) if is_observed.all() else is_observed  # a mask copies
         for _ in range(_PROJECTION_ITERATIONS):
             # Phase 2 with known matches: pose and coefficients alternate, since modes may contain a part of a pose.
-            T_shape_model = fit_similarity(Q[is_observed], vertices[is_observed], with_scale=self.gauge == "shape")
+            T_shape_model = fit_similarity(Q[used], vertices[used], with_scale=self.gauge == "shape")
             before, b = b, self.nearest(T_shape_model.inverse().apply(vertices))
             if np.abs(b - before).max() <= _PROJECTION_TOLERANCE * self.stddev[0]:
                 break
@@ -403,9 +404,9 @@ class ShapeModel:
             noise: s, the variance of a coordinate outside the modes, mm^2; None for `noise_variance`.
         """
         off, modes_used = vertices - self.mean_vertices, self._vertex_modes[:modes]
-        is_observed: BoolArray = ~np.logical_or.reduce(np.isnan(vertices), axis=1)
-        if is_observed.all():
+        if not np.isnan(vertices).any():
             return modes_used @ off.reshape(-1)
+        is_observed: BoolArray = ~np.logical_or.reduce(np.isnan(vertices), axis=1)
         seen = modes_used.reshape(len(modes_used), -1, 3)[:, is_observed].reshape(len(modes_used), -1)
         noise = max(self.noise_variance, _LEAST_NOISE * self.stddev[0] ** 2) if noise is None else noise
         precision = seen @ seen.T + np.diag(noise / self.stddev[:modes] ** 2)

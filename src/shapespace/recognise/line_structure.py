@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import rankdata
 
 from shapespace.errors import InputError
 from shapespace.types import FloatArray
@@ -107,12 +106,12 @@ def line_scores(v: FloatArray, intensity: FloatArray, *, permutations: int = 999
     if energy == 0:
         raise InputError("All samples of this expression are neutral, so they have no line.")
     along = _position(v)
-    centred = v - v.mean(axis=0)
-    singular = np.linalg.svd(centred, compute_uv=False)
+    singular = np.linalg.svd(v - v.mean(axis=0), compute_uv=False)
     spread = float((singular**2).sum())
-    rho = _spearman(along, intensity)
+    ranks, wanted = _ranks(along), _ranks(intensity)
+    rho = _correlation(ranks, wanted)
     rng = np.random.default_rng(seed)
-    shuffled = [_spearman(along, rng.permutation(intensity)) for _ in range(permutations)]
+    shuffled = [_correlation(ranks, rng.permutation(wanted)) for _ in range(permutations)]
     return LineScores(
         r2_through_neutral=float((along**2).sum()) / energy,
         r2_free=float(singular[0] ** 2) / spread if spread > 0 else 1.0,
@@ -154,13 +153,10 @@ def pooled_line_scores(
     shuffled = np.stack([_line_r2(gram, rng.permutation(classes)) for _ in range(permutations)])
     rho = monotonicity_p = None
     if intensity is not None:
-        groups = [np.flatnonzero(classes == c) for c in range(len(names))]
-        along = [_position(v[rows]) for rows in groups]
-        rho = float(np.mean([_spearman(a, intensity[rows]) for a, rows in zip(along, groups, strict=True)]))
-        drawn = [
-            float(np.mean([_spearman(a, rng.permutation(intensity[m])) for a, m in zip(along, groups, strict=True)]))
-            for _ in range(permutations)
-        ]
+        groups = [classes == c for c in range(len(names))]
+        pairs = [(_ranks(_position(v[rows])), _ranks(intensity[rows])) for rows in groups]
+        rho = float(np.mean([_correlation(a, b) for a, b in pairs]))
+        drawn = [float(np.mean([_correlation(a, rng.permutation(b)) for a, b in pairs])) for _ in range(permutations)]
         monotonicity_p = _permutation_p(rho, drawn)
     class_names = [str(name) for name in names]
     return PooledLineScores(
@@ -230,11 +226,16 @@ def _position(v: FloatArray) -> FloatArray:
     return -along if along.sum() < 0 else along
 
 
-def _spearman(a: FloatArray, b: FloatArray) -> float:
-    ranks_a, ranks_b = rankdata(a), rankdata(b)
-    ranks_a, ranks_b = ranks_a - ranks_a.mean(), ranks_b - ranks_b.mean()
-    scale = float(np.sqrt((ranks_a**2).sum() * (ranks_b**2).sum()))
-    return float((ranks_a * ranks_b).sum()) / scale if scale > 0 else 0.0
+def _ranks(values: FloatArray) -> FloatArray:
+    """Return the ranks (n,) less their mean; equal values share the mean of theirs."""
+    _, place, count = np.unique(values, return_inverse=True, return_counts=True)
+    return (np.cumsum(count) - (count - 1) / 2)[place] - (len(values) + 1) / 2
+
+
+def _correlation(a: FloatArray, b: FloatArray) -> float:
+    """Return the correlation of centred values (n,), 0 if all of `a` or `b` are equal."""
+    scale = float(np.sqrt((a**2).sum() * (b**2).sum()))
+    return float((a * b).sum()) / scale if scale > 0 else 0.0
 
 
 def _accuracy(unit: FloatArray, classes: np.ndarray) -> float:

@@ -15,7 +15,6 @@ from inspect import signature
 from typing import Any, ParamSpec, TypeAlias, TypeVar, cast
 
 import numpy as np
-from scipy.stats import norm, t
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.step_counter import Progress
@@ -94,6 +93,8 @@ def pool_p_values(p: FloatArray, least: float) -> tuple[FloatArray, FloatArray]:
     Returns:
         p (...), and the fraction of missing information.
     """
+    from scipy.stats import norm  # loads much
+
     pooled = pool_estimates(norm.isf(np.clip(p, least, 1 - least)), 1.0)  # S75
     return norm.sf(pooled.value / np.sqrt(pooled.variance)), pooled.missing_information  # S76
 
@@ -108,6 +109,8 @@ def pool_intervals(figures: FloatArray, level: float) -> FloatArray:
     Returns:
         The same (..., 3), combined.
     """
+    from scipy.stats import norm, t  # loads much
+
     values, tail = figures[..., 0], (1 + level) / 2
     ends: list[FloatArray] = []
     for column, sign in ((1, -1.0), (2, 1.0)):

@@ -78,7 +78,7 @@ class ModelView:
         """
         if not path.is_dir() or looks_like_model(path):
             if model is not None:
-                raise InputError(f"{path} is not a folder of fits; leave --model out, or give the folder.")
+                raise InputError(f"{path} is not a folder of fits; omit --model, or give the folder.")
             if path.exists() and not looks_like_model(path):
                 raise InputError(
                     f"{path} is no model (.h5) and no folder; give the model, or the folder that shapespace fit wrote."

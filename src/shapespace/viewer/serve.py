@@ -18,7 +18,7 @@ from tempfile import TemporaryDirectory
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from shapespace.batch.workers import preload, start_loading
+from shapespace.batch.workers import context, interrupts_ignored, preload, start_loading
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.schemas import CorrespondenceRecord
 
@@ -78,7 +78,7 @@ def serve(
     has_surfaces, is_project = (path / CorrespondenceRecord.FILE).is_file(), _is_project(path)
     if (has_surfaces or is_project) and model is not None:
         what = "a correspondence" if has_surfaces else "a project"
-        raise InputError(f"{path} is {what} without fits; leave --model out.")
+        raise InputError(f"{path} is {what} without fits; omit --model.")
     if is_project:
         serve_studio(
             path, forms(), host=host, port=port, open_browser=open_browser, max_upload_mb=max_upload_mb, read_only=True,
@@ -138,16 +138,20 @@ def serve_studio(
         preload(("shapespace.viewer.studio.specimen_checks",))
     from shapespace.report.pages.write_html import require_report_extra
     from shapespace.viewer.studio.app import Studio, make_studio
+    from shapespace.viewer.studio.specimen_checks import compile_fits
 
     require_report_extra()
     with _end_by_signals(), ExitStack() as stack:
         studio = Studio(forms, project, max_upload_mb * 2**20, read_only=read_only)
         stack.callback(studio.close)
-        what = "viewer" if read_only else "studio"
+        if not read_only:
+            with interrupts_ignored():
+                context().Process(target=compile_fits, name=compile_fits.__name__, daemon=True).start()
 
         def started(server: uvicorn.Server) -> None:
             studio.ends = lambda: server.should_exit
 
+        what = "viewer" if read_only else "studio"
         _run(partial(make_studio, studio), what, host, port, open_browser=open_browser, started=started, say=say)
 
 
@@ -261,7 +265,7 @@ def listen(host: str, port: int | None) -> socket.socket:
             raise InputError(f"The viewer cannot listen on {host!r}: it is not an address of this machine.") from error
         return listener
     if port is not None:
-        raise InputError(f"Port {port} is taken by another program; choose another one, or leave --port out.")
+        raise InputError(f"Port {port} is taken by another program; choose another one, or omit --port.")
     raise InputError(f"The ports from {FIRST_PORT} to {FIRST_PORT + _PORTS_TRIED - 1} are taken; choose one by --port.")
 
 

@@ -31,6 +31,8 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
+from matplotlib.image import BboxImage
+from matplotlib.transforms import Bbox, TransformedBbox
 
 from shapespace.errors import InputError
 from shapespace.io.files import write_bytes
@@ -64,8 +66,7 @@ TITLE, TEXT, SMALL = 12.0, 11.0, 9.5  # layout: type sizes, points
 MOST_PANELS = 48  # limit on the size of a figure
 FEWEST_BINNED = 10
 """Smallest number of values of a histogram; fewer are drawn as dots."""
-_GAP, _EDGE = 8, 4  # layout: pixels
-_MOST_LINES = 4  # layout: lines of a caption
+_GAP, _EDGE, _MOST_LINES = 8, 4, 4  # layout: pixels, and lines of a caption
 _LEGEND_MARK = 3.6  # layout: width of an entry of a legend without its name, in sizes of its type
 # steps between tick labels, and how many labels fit next to each other
 _STEPS, _MOST_NUMBERS = (1, 5, 10, 20, 50, 100, 200, 500), 22
@@ -183,8 +184,7 @@ def equal_views(sides: Sequence[tuple[FloatArray, float]], columns: int) -> tupl
     tall = max(item.camera.height_mm for item in views)
     across = max(item.camera.height_mm * item.size[0] / item.size[1] for item in views)
     height = min(max(round(width * tall / across), round(width / 3)), round(width * 1.5))
-    height_mm = max(tall, across * height / width)
-    return [replace(item.camera, height_mm=height_mm) for item in views], (width, height)
+    return [replace(item.camera, height_mm=max(tall, across * height / width)) for item in views], (width, height)
 
 
 def surroundings(fit: StagedFit) -> FloatArray:
@@ -282,11 +282,14 @@ def _compose(
 ) -> Figure:
     """Return a figure of this size in pixels with pictures and lines of text at their places, from the upper left."""
     figure = DisplayedFigure(figsize=(total_w / DPI, total_h / DPI), dpi=DPI, facecolor="white")
+    figure.suppressComposite = True  # a vector file keeps each picture
     for x, top, image in pictures:
         high, wide = (side / LAYOUT.get().panel_scale for side in image.shape[:2])
-        axes = figure.add_axes((x / total_w, 1 - (round(top) + high) / total_h, wide / total_w, high / total_h))
-        axes.imshow(image, interpolation="nearest", aspect="auto")
-        axes.set_axis_off()
+        place = Bbox.from_bounds(x / total_w, 1 - (round(top) + high) / total_h, wide / total_w, high / total_h)
+        # Axes, with their ticks, would take several times as long.
+        panel = BboxImage(TransformedBbox(place, figure.transFigure), interpolation="nearest")
+        panel.set_data(image)
+        figure.add_artist(panel)
     for x, top, text, style in texts:
         figure.text(x / total_w, 1 - top / total_h, escaped(text), **style)
     return figure

@@ -423,11 +423,8 @@ def _direction(x: float, y: float, z: float) -> _Single:
 
 _KEY = _direction(-0.50, 0.58, 0.64)
 _FILL = _direction(0.80, 0.05, 0.60)
-_WARM = np.array([1.00, 0.965, 0.92], dtype=np.float32)
-_COOL = np.array([0.86, 0.95, 1.10], dtype=np.float32)
+_WARM, _COOL = np.array([[1.00, 0.965, 0.92], [0.86, 0.95, 1.10]], dtype=np.float32)
 _HALF = _direction(*(float(v) for v in _KEY + np.array([0, 0, 1])))
-
-
 _LIGHTS = np.stack([_KEY, _FILL, _HALF, _WARM, _COOL])
 
 

@@ -125,6 +125,14 @@ def _start_process() -> None:
         end_after(server.join)
 
 
+def compile_fits() -> None:
+    """Compile the code of a fit, unless it is compiled, so that the first fit does not wait for it."""
+    _start_process()
+    from shapespace.batch.warm import warm_up  # loads the code of a fit
+
+    warm_up(notify=False)
+
+
 def _load_code() -> None:
     """Check and draw a tetrahedron, for which the compiled code is loaded."""
     vertices = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
