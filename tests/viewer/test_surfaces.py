@@ -249,7 +249,7 @@ def test_a_surface_that_is_damaged_is_one_sentence_and_the_others_stay(template:
 
 
 def test_a_folder_that_cannot_be_shown_is_one_sentence(template: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="leave --model out"):
+    with pytest.raises(InputError, match="omit --model"):
         serve(template, model=template / "m.h5", open_browser=False)
     (tmp_path / "correspondence.json").write_text("{")
     with pytest.raises(FileFormatError, match=r"correspondence\.json"):
