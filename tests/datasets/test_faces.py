@@ -338,5 +338,5 @@ def test_weak_expressions_are_written_with_their_intensity_and_full_ones_as_befo
         )
         # Units add up, so a weak smile is the share of the full one that its label says.
         np.testing.assert_allclose(weakly - rest, told[f"subject_00{k}_smile.ply"] * (smile - rest), atol=0.05)
-    with pytest.raises(InputError, match="above 0 and at most at 1"):
+    with pytest.raises(InputError, match="above 0 and at most 1"):
         write_faces(tmp_path / "none", **asked, intensities=(0.0,))

@@ -16,6 +16,7 @@ from shapespace.commands.inputs import given_scans
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.files import make_folder
 from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
+from shapespace.schemas import CorrespondRecord
 from shapespace.types import Mesh
 from shapespace.viewer.studio.job_commands import checks, order, outdated_results
 from shapespace.viewer.studio.jobs import Job, Order, history
@@ -183,7 +184,6 @@ RIGHT = {"anna": {"sex": "f", "weight": "3.5"}, "ben": {"sex": "m", "weight": "4
 
 @pytest.mark.parametrize(("text", "column", "at"), [
     ("carl\tm\t5\nanna\tf\t3.5\nben\tm\t4", "", "anna"),
-    ("carl\tm\t5\nanna\tf\t3.5\nben\tm\t4", "sex", "carl"),
     ("Specimen\tweight\tsex\nCARL.ply\t5\tm\nanna\t3,5\tf\nben\t4\tm", "", "ben"),
     ("weight\tname\tsex\n5\tcarl\tm\n3.5\tanna\tf\n4\tben\tm", "weight", "anna"),
 ])  # fmt: skip
@@ -194,6 +194,30 @@ def test_rows_that_name_their_specimens_go_to_these_from_any_order_and_cell(
     assert matched.by_name and matched.certain and matched.cells == RIGHT and matched.notes == ()
     edit(weighed, what="block", columns=matched.columns, cells=matched.cells)
     assert {one.id: one.cells for one in weighed.state.specimens} == RIGHT
+
+
+def test_names_in_a_column_of_values_may_be_values_and_are_shown_before_they_are_used(weighed: Project) -> None:
+    matched = match(weighed, "carl\tm\t5\nanna\tf\t3,5\nben\tm\t4", "sex", "carl")
+    assert matched.by_name and not matched.certain and matched.cells == RIGHT
+
+
+def test_a_decimal_comma_in_a_column_of_numbers_is_a_decimal_point(weighed: Project) -> None:
+    for name, value in (("anna", "3,5"), ("ben", "-4,25")):
+        edit(weighed, what="cells", cells=[{"id": name, "column": "weight", "value": value}])
+        edit(weighed, what="cells", cells=[{"id": name, "column": "sex", "value": "x"}])
+    edit(weighed, what="cells", cells=[{"id": "carl", "column": "sex", "value": "1,2"}])
+    assert [one.cells["weight"] for one in weighed.state.specimens[:2]] == ["3.5", "-4.25"]
+    assert weighed.state.specimens[2].cells["sex"] == "1,2"  # among words it is a word
+    assert match(weighed, "1,5\n2,5", "weight").cells == {"anna": {"weight": "1.5"}, "ben": {"weight": "2.5"}}
+
+
+def test_columns_whose_names_have_a_meaning_of_their_own_are_not_taken(project: Project) -> None:
+    columns, cells, notes = cells_of_table(b"file,id,log_size,a`b,mass\nanna.ply,M0,1,2,3\n", project.state)
+    assert columns == ["mass"] and cells == {"anna": {"mass": "3"}}
+    assert any("id, log_size, a`b" in note for note in notes)
+    for name in ("id", "log_size", "a`b"):
+        with pytest.raises(InputError, match="cannot be called"):
+            edit(project, what="add-column", column=name)
 
 
 def test_a_block_without_names_is_shown_before_it_is_pasted(weighed: Project) -> None:
@@ -365,7 +389,7 @@ class Done:
         )  # fmt: skip
         if kind == "correspond":
             for name in ids(self.project):
-                tetrahedron(make_folder(self.project.folder / made.output) / f"{name}.ply", 1.0)
+                tetrahedron(make_folder(self.project.folder / made.output) / f"{name}{CorrespondRecord.SURFACE}", 1.0)
         return number
 
     @property
@@ -393,7 +417,10 @@ def test_results_are_outdated_by_the_edits_that_they_depend_on_and_by_no_others(
     project = answered.project
     assert answered.outdated == {}
     edit(project, what="cells", cells=[{"id": "ben", "column": "group", "value": "b"}])
-    assert answered.outdated == {3: "table", 5: "source"}
+    assert answered.outdated == {3: "table", 5: "table"}
+    edit(project, what="remove-column", column="group")
+    assert answered.outdated == {3: "table", 5: "table"}
+    project.undo(project.revision)
     edit(project, what="add-column", column="site")
     edit(project, what="rename", id="carl", to="carol")
     project.undo(project.revision)
@@ -404,8 +431,14 @@ def test_results_are_outdated_by_the_edits_that_they_depend_on_and_by_no_others(
     assert answered.outdated == {2: "landmarks", 5: "source"}
     project.undo(project.revision)
     edit(project, what="include", ids=["anna"], included=False)
-    assert answered.outdated == {1: "specimens", 2: "specimens", 3: "specimens", 4: "specimens", 5: "source"}
+    assert answered.outdated == {2: "specimens", 3: "specimens", 4: "specimens", 5: "source"}
+    again = answered.run("build")
+    made = answered.jobs[-1].arguments
+    assert "correspondence-1/ben.corresponding.ply" in made and not any("anna" in word for word in made)
+    assert answered.run("compare", {"--formula": "~ age"}) not in answered.outdated and again not in answered.outdated
     project.undo(project.revision)
+    assert answered.outdated == {6: "specimens", 7: "specimens"}
+    del answered.jobs[5:]
     edit(project, what="mirror", ids=["anna"], mirrored=True)
     assert answered.outdated == {1: "specimens", 2: "source", 3: "source", 4: "source", 5: "source"}
     project.undo(project.revision)
@@ -453,7 +486,7 @@ def analysed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Project:
     made = Project.open(tmp_path / "bones", create=True)
     (made.folder / "correspondence-1").mkdir()
     for name, mesh in zip(GROUPS, training_meshes(12, 150), strict=True):
-        write_mesh(made.folder / "correspondence-1" / f"{name}.ply", mesh)
+        write_mesh(made.folder / "correspondence-1" / f"{name}{CorrespondRecord.SURFACE}", mesh)
         made.add(tetrahedron(made.new_file(f"{name}.ply"), 1.0 + int(name[1:])), "training")
     rows = (f"{name},{','.join(GROUPS[name])}" for name in sorted(GROUPS, key=lambda name: (name[::-1], name)))
     join_table(made, "\n".join(["id,Group #,sex (m/f),age", *rows]).encode())

@@ -27,7 +27,7 @@ from shapespace.viewer.guard import Access
 from shapespace.viewer.studio import run_job
 from shapespace.viewer.studio.app import Studio, make_studio
 from shapespace.viewer.studio.jobs import Jobs, Order
-from shapespace.viewer.studio.specimen_checks import compile_fits
+from shapespace.viewer.studio.specimen_checks import SpecimenChecks, compile_fits
 
 FORMS = forms(summaries_and_options())
 
@@ -106,6 +106,20 @@ def test_dropped_scans_are_checked_pictured_and_listed(tmp_path: Path) -> None:
         answer = client.get("/api/scans/broken")
         assert answer.status_code == 422 and str(tmp_path) not in answer.json()["error"]
         assert client.get("/api/scans/nobody").status_code == 404
+
+
+def test_a_usable_scan_is_never_excluded_however_often_its_check_is_asked_for(tmp_path: Path) -> None:
+    excluded: list[Path] = []
+    checks = SpecimenChecks(tmp_path / "p", lambda: None, excluded.append)
+    scans = [tetrahedron(tmp_path / f"s{k}.ply", 1.0 + k) for k in range(20)]
+    end = time.monotonic() + 60
+    try:
+        # The file of a check is read here before its process has reported it.
+        while any(checks.facts(scan) is None for scan in scans):
+            assert time.monotonic() < end
+    finally:
+        checks.close()
+    assert excluded == [] and all(checks.facts(scan)["state"] == "ready" for scan in scans)
 
 
 def test_what_cannot_be_taken_is_refused_in_a_sentence(tmp_path: Path) -> None:

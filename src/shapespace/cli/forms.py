@@ -125,7 +125,7 @@ def forms(commands: Mapping[str, tuple[str, Sequence[Option]]]) -> dict[str, dic
         }  # fmt: skip
     made["convert"]["options"][0] |= {"kind": "choice", "choices": list(MODEL_FORMATS)}
     made["score"]["options"][0] |= {"kind": "class", "help": "class that the others are compared with"}
-    hold = next(option for option in made["regress"]["options"] if option["flag"] == "--hold")
+    hold = next(option for option in made["regress"]["options"] if option["label"] == _LABELS["hold"])
     hold["help"] = "with --along: class of another column for which shapes are predicted"
     return made
 

@@ -54,6 +54,9 @@ def report(
     """
     from shapespace.report.pages.write_html import write_study_report
 
+    inputs = [path.resolve() for path in (*results, *([] if specimens is None else [specimens]))]
+    if output is not None and (output.suffix.lower() not in (".html", ".htm") or output.resolve() in inputs):
+        raise InputError(f"{output} cannot be the file of the report; give a name that ends in .html.")
     if len(results) == 1 and specimens is None and results[0].suffix != ".h5":
         page = write_report(results[0], output, model=model, labels=labels, quiet=quiet)
     elif model is not None or labels is not None:

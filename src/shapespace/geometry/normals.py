@@ -53,6 +53,20 @@ def without_estimates(mesh: Mesh) -> Mesh:
     return replace(mesh, vertices=vertices, observed=None)
 
 
+def observed_mask(vertices: FloatArray) -> BoolArray:
+    """Return the mask (V,) of `vertices` (V, 3) that are not missing."""
+    return np.isfinite(vertices.sum(axis=1))
+
+
+def drawable(mesh: Mesh, values: FloatArray | None = None) -> tuple[Mesh, FloatArray | None]:
+    """Return `mesh` without missing vertices, and the `values` (V,) of the remaining ones."""
+    is_observed = observed_mask(mesh.vertices)
+    if is_observed.all():
+        return mesh, values
+    vertices, faces = without_vertices(mesh.vertices, faces_of(mesh), is_observed)
+    return Mesh(vertices, faces, name=mesh.name), None if values is None else values[is_observed]
+
+
 def rms_size(points: FloatArray) -> float:
     """Return the RMS distance of `points` (N, 3) from their mean."""
     return float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))

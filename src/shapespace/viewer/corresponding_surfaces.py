@@ -27,7 +27,7 @@ from shapespace.report.inputs.correspondence_folder import (
 )
 from shapespace.report.inputs.saved_fits import ScanNotFoundError
 from shapespace.report.render import palette as colours
-from shapespace.report.render.scene import decimate, pack, quantise
+from shapespace.report.render.scene import bounded_scan, decimate, pack, quantise
 from shapespace.report.render.thumbnails import SQUARES, checker_places, mean_at_vertices
 from shapespace.types import FloatArray
 from shapespace.version import __version__
@@ -202,7 +202,8 @@ class Surfaces:
         values = {"fold": folds, "stretch": growth}
         arrays = {"growth": growth.astype(np.float32)}
         with contextlib.suppress(ScanNotFoundError):
-            values["distance"] = self._corresponded.scan_on_mean(record, placed)[1]
+            scan = bounded_scan(self._corresponded.raw_scan(record))
+            values["distance"] = self._corresponded.scan_on_mean(scan, placed)[1]
             arrays["distance"] = values["distance"].astype(np.float32)
         if placed.position_std is not None:
             values["uncertain"] = np.where(placed.seen, placed.position_std, np.nan)

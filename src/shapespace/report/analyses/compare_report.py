@@ -170,7 +170,7 @@ def _subject_warnings(result: CompareResult) -> Iterator[str]:
         if all(names) and len(set(names)) < len(names):
             yield (
                 f"The {len(names)} shapes are of {len(set(names))} subjects and are treated as independent, which "
-                "makes p values too small; name the column subject with --blocks."
+                "makes p values too small; pass --blocks subject."
             )
         return
     counts = Counter(table.texts(blocks))

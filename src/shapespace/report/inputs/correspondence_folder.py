@@ -19,15 +19,14 @@ from shapespace.geometry.normals import (
     boundary_edges,
     face_vectors,
     faces_of,
+    observed_mask,
     rms_size,
     without_estimates,
-    without_vertices,
 )
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.files import read_error
 from shapespace.report.blocks.wording import known, printable, sentence, without_folders
 from shapespace.report.inputs.saved_fits import Folder, ScanNotFoundError, nice_ceiling, unchanged_scan
-from shapespace.report.render.scene import decimate
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, read
 from shapespace.store.corresponding import describe_review
 from shapespace.types import BoolArray, FloatArray, Mesh, Similarity, are_same_triangles
@@ -36,7 +35,6 @@ _FEWEST_VERTICES = 3  # a triangle
 _ONE_UNIT = 5.0  # ratio of scales; mm, cm and m differ by 10 or more
 _POSED_ALIKE = 0.8  # strength of the mean rotation above which the scans share a pose
 _POSES = 24  # surfaces that determine the pose of the mean shape
-_TRIANGLES_DRAWN = 400_000  # triangles of a scan; more are smaller than a pixel of the pictures
 _OPEN_SHARE = 0.15  # share of the area that faces one way in an open surface
 
 
@@ -195,21 +193,12 @@ class Corresponded:
         scan = unchanged_scan(self.root, record.path, record.hash)
         return mirror_image(scan) if record.mirrored else scan
 
-    def scan_on_mean(self, record: CorrespondRecord, placed: PlacedSurface) -> tuple[Mesh, FloatArray]:
-        """Return the scan moved onto the mean shape, and the distance (V,) of each vertex from it, share of the size.
-
-        Raises:
-            ScanNotFoundError: the scan was moved or changed, or cannot be read.
-        """
-        scan = drawable(self.bounded_scan(record))[0]
+    def scan_on_mean(self, scan: Mesh, placed: PlacedSurface) -> tuple[Mesh, FloatArray]:
+        """Return a scan moved onto the mean shape, and the distance (V,) of each vertex from it, share of the size."""
         moved = scan.with_vertices(placed.T_scan_mean.inverse().apply(scan.vertices))
         distance = np.full(len(placed.vertices), np.nan)
         distance[placed.seen] = build_engine(moved).query(placed.vertices[placed.seen]).distance
         return moved, distance / rms_size(self._mean.vertices)
-
-    def bounded_scan(self, record: CorrespondRecord) -> Mesh:
-        """Return the scan of a record with at most as many triangles as pictures show; see `raw_scan`."""
-        return decimate(self.raw_scan(record), _TRIANGLES_DRAWN)[0]
 
     def turn_upright(self) -> None:
         """Bring the mean shape upright, by the poses of some of the surfaces."""
@@ -298,20 +287,6 @@ class Corresponded:
             return None
         # A report is mailed and a viewer has visitors: neither may reveal the folders of this machine.
         return structs.replace(record, reason=without_folders(record.reason))
-
-
-def observed_mask(vertices: FloatArray) -> BoolArray:
-    """Return the mask (V,) of `vertices` (V, 3) that are not missing."""
-    return np.isfinite(vertices.sum(axis=1))
-
-
-def drawable(mesh: Mesh, values: FloatArray | None = None) -> tuple[Mesh, FloatArray | None]:
-    """Return `mesh` without missing vertices, and the `values` (V,) of the remaining ones."""
-    is_observed = observed_mask(mesh.vertices)
-    if is_observed.all():
-        return mesh, values
-    vertices, faces = without_vertices(mesh.vertices, faces_of(mesh), is_observed)
-    return Mesh(vertices, faces, name=mesh.name), None if values is None else values[is_observed]
 
 
 def upright(mean: Mesh, turns: Sequence[FloatArray] = ()) -> FloatArray:

@@ -50,7 +50,6 @@ from shapespace.report.inputs.correspondence_folder import (
     Corresponded,
     concerns_of,
     distance_share,
-    drawable,
     scan_status,
     upright,
 )
@@ -58,8 +57,10 @@ from shapespace.report.inputs.saved_fits import Folder, nice_ceiling
 from shapespace.report.pages.page import Chapter, Page
 from shapespace.report.render import thumbnails
 from shapespace.report.render.palette import DIVERGING, SEQUENTIAL
+from shapespace.report.render.scene import bounded_scan
 from shapespace.reprs import describe_groups, first_names
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondRecord, Quality
+from shapespace.types import Mesh
 from shapespace.version import __version__
 
 # Items on a page: what can be looked through without paging, and a page that stays within its bytes.
@@ -431,7 +432,7 @@ class CorrespondencePage:
     def _still(self, record: CorrespondRecord, limit: float) -> tuple[Image, str]:
         """Return the picture of a scan, and a sentence on a missing scan."""
         if record in self.out:
-            scan = drawable(self.result.bounded_scan(record))[0]
+            scan = self._bounded(record)
             if scan.faces is not None:
                 scan = scan.with_vertices(scan.vertices @ upright(scan).T)
             return self.page.image(thumbnails.mesh_still(scan), f"The scan {record.name}, excluded"), ""
@@ -439,12 +440,15 @@ class CorrespondencePage:
         scan, note = None, ""
         far = np.full(len(placed.vertices), nan)
         try:
-            scan, far = self.result.scan_on_mean(record, placed)
+            scan, far = self.result.scan_on_mean(self._bounded(record), placed)
         except FileFormatError as error:
             note = f"The picture lacks the scan: {error}"
         still = thumbnails.correspondence_strip(self.mean, placed.vertices, scan, 100 * far, limit)
         seen = "the scan, the checkerboard, distances and areas" if scan else "the checkerboard and areas"
         return self.page.image(still, f"{record.name}: {seen}"), note
+
+    def _bounded(self, record: CorrespondRecord) -> Mesh:
+        return bounded_scan(self.result.raw_scan(record))
 
     def numbers(self) -> list[Block]:
         """Return the table of all scans."""

@@ -22,6 +22,7 @@ import numpy.typing as npt
 
 from shapespace.cohort.orientation import current_orientation
 from shapespace.errors import InputError, MeshError
+from shapespace.geometry.normals import drawable
 from shapespace.geometry.remesh import collapse
 from shapespace.report.inputs.saved_fits import StagedFit, mean_mm, measured_mm
 from shapespace.report.render import palette as colours
@@ -567,7 +568,13 @@ WIDGET_SCRIPTS = tuple(f"widget-{part}.js" for part in (
 """Views with their controls for reports; they need the scripts of scenes and `Shapespace.colours` before them."""
 
 
+_MOST_PICTURED = 400_000  # triangles of a scan; more are smaller than a pixel of the pictures
 _MOST_COLLAPSED = 150_000  # triangles; larger scans are clustered on a grid first, which is faster
+
+
+def bounded_scan(scan: Mesh) -> Mesh:
+    """Return a scan without missing vertices, and with at most as many triangles as pictures show."""
+    return drawable(decimate(scan, _MOST_PICTURED)[0])[0]
 
 
 def decimate(scan: Mesh, largest: int) -> tuple[Mesh, npt.NDArray[np.intp]]:

@@ -10,8 +10,7 @@ from typing import TypeAlias
 import numpy as np
 
 from shapespace.errors import InputError
-from shapespace.geometry.normals import Distortion, faces_of
-from shapespace.report.inputs.correspondence_folder import drawable, observed_mask
+from shapespace.geometry.normals import Distortion, drawable, faces_of, observed_mask
 from shapespace.report.inputs.saved_fits import StagedFit
 from shapespace.report.render.palette import CATEGORIES, DIVERGING, MODEL_COLOUR, SCAN_COLOUR, SEQUENTIAL, Colour
 from shapespace.report.render.renderer import (

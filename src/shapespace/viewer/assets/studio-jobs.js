@@ -89,6 +89,7 @@
     const [values, setValues] = useState(() => ({ ...initial, ...defaults, ...Studio.jobsOf([kind])[0]?.options }));
     const [on, setOn] = useState("");
     const [checks, setChecks] = useState(null);
+    const [checkedFor, setCheckedFor] = useState(null); // settings of these checks; a problem of earlier ones does not keep a run back
     const [starting, setStarting] = useState(false);
     const { columns, jobs, revision } = Studio.state.project;
     const options = form ? changedOptions(form, values) : {};
@@ -99,7 +100,7 @@
       const timer = setTimeout(async () => {
         let result = null;
         try { result = await Studio.post("/api/checks", { kind, options, on: on ? Number(on) : null }); } catch (error) { result = [{ level: "problem", text: error.message }]; }
-        if (current) setChecks(result);
+        if (current) { setChecks(result); setCheckedFor(asked); }
       }, CHECK_AFTER);
       return () => { current = false; clearTimeout(timer); };
     }, [asked, revision, kind]);
@@ -108,7 +109,7 @@
     const show = (option) => html`<${Option} key=${option.flag} option=${option} value=${values[option.flag]} columns=${columns} onvalue=${(value) => setValues((before) => ({ ...before, [option.flag]: value }))} />`;
     const folded = form.options.filter((option) => !option.visible);
     const missing = form.options.some((option) => option.required && !options[option.flag]);
-    const problem = checks && checks.some((check) => check.level === "problem");
+    const problem = checkedFor === asked && checks && checks.some((check) => check.level === "problem");
     const run = async (event) => {
       event.preventDefault();
       setStarting(true);

@@ -40,8 +40,7 @@
   Studio.Questions = function Questions({ next }) {
     const [{ kind, first }, setQuestion] = useState({});
     if (kind) return html`<${Question} key=${kind} kind=${kind} first=${first} next=${next} onback=${() => setQuestion({})} />`;
-    // Of runs with the same settings the newest counts.
-    const earlier = Array.from(new Map(Studio.jobsOf(KINDS).reverse().map((job) => [JSON.stringify([job.kind, job.on, job.options]), job])).values()).reverse();
+    const earlier = Studio.newestOfEach(Studio.jobsOf(KINDS));
     return html`
       <div class="fill scroll" data-testid="screen-questions">
         <div class="row bar"><h2>${Q.title}</h2><span class="grow"></span>

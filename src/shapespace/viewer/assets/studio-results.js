@@ -43,7 +43,7 @@
 
   Studio.Export = function Export({ project }) {
     const done = project.jobs.filter((job) => job.status === "done").reverse();
-    const busy = Studio.jobsOf(["report"]).some(Studio.isActive), outdated = done.filter((job) => job.outdated).length;
+    const busy = Studio.jobsOf(["report"]).some(Studio.isActive), outdated = Studio.newestOfEach(done).filter((job) => job.outdated).length;
     return html`
       <div class="fill scroll" data-testid="screen-export">
         <div class="row bar"><div><h2>${T.export.title}</h2><p class="hint">${T.export.intro}</p></div><span class="grow"></span>

@@ -211,7 +211,9 @@
 
   const jobsOf = (kinds) => Studio.state.project.jobs.filter((job) => kinds.includes(job.kind)).sort((a, b) => b.number - a.number);
   const newest = (...kinds) => jobsOf(kinds).find((job) => job.status === "done");
+  /** Of jobs with the same settings, the newest first, the newest. */
+  const newestOfEach = (jobs) => Array.from(new Map([...jobs].reverse().map((job) => [JSON.stringify([job.kind, job.on, job.options]), job])).values()).reverse();
   const isActive = (job) => job.status === "running" || job.status === "waiting";
 
-  Object.assign(Studio, { ask, json, post, refresh, listen, act, edit, editBy, runFigures, undo, redo, runJob, upload, uploading, filesOfDrop, jobsOf, newest, isActive });
+  Object.assign(Studio, { ask, json, post, refresh, listen, act, edit, editBy, runFigures, undo, redo, runJob, upload, uploading, filesOfDrop, jobsOf, newest, newestOfEach, isActive });
 })();

@@ -18,8 +18,25 @@
     return Boolean(next);
   }
 
-  /** Rows and columns of pasted text, where a spreadsheet put quotation marks around cells with line breaks. */
-  const block = (text) => text.replace(/\r\n?/g, "\n").replace(/\n$/, "").split("\n").map((line) => line.split("\t").map((cell) => cell.replace(/^"(.*)"$/, "$1")));
+  /** Rows and columns of pasted text, where a spreadsheet put quotation marks around cells with line breaks or quotation marks. */
+  function block(pasted) {
+    const text = pasted.replace(/\r\n?/g, "\n").replace(/\n$/, ""), rows = [[]];
+    let cell = "", isQuoted = false;
+    const end = () => { rows.at(-1).push(cell); cell = ""; };
+    for (let k = 0; k < text.length; k++) {
+      const letter = text[k];
+      if (isQuoted) {
+        if (letter !== '"') cell += letter;
+        else if (text[k + 1] === '"') cell += text[++k];
+        else isQuoted = false;
+      } else if (letter === '"' && cell === "") isQuoted = true;
+      else if (letter === "\t") end();
+      else if (letter === "\n") { end(); rows.push([]); } else cell += letter;
+    }
+    end();
+    // A quotation mark that does not end, as of inches, is a letter.
+    return isQuoted ? text.split("\n").map((line) => line.split("\t")) : rows;
+  }
 
   /** A cell: its text is sent when it is left; Escape restores it. */
   function Cell({ value, label, testid, row, column, onedit, onblock }) {
@@ -97,7 +114,7 @@
   /** The specimens and cells of a pasted block, before it is pasted. */
   function Preview({ match, onclose }) {
     const columns = [...new Set(Object.values(match.cells).flatMap(Object.keys))], rows = Object.entries(match.cells);
-    const paste = async () => { if (await Studio.edit({ what: "block", columns: match.columns, cells: match.cells })) onclose(); };
+    const paste = async () => { if (await Studio.edit({ what: "block", columns: match.columns, cells: match.cells, seen: match.seen })) onclose(); };
     return html`
       <${Dialog} title=${S.paste.title(rows.length)} testid="paste" onclose=${onclose} wide>
         <p>${match.by_name ? S.paste.byName : S.paste.byPosition}</p>

@@ -112,7 +112,7 @@ class OpenProject:
     def facts(self) -> dict[str, Any]:
         """Return the state for the page."""
         project, state, jobs = self.project, self.project.state, self.jobs.all()
-        key = (project.revision, [(job.number, job.status) for job in jobs])
+        key = (state, [(job.number, job.status) for job in jobs])
         if key != self._outdated[0]:
             self._outdated = key, outdated_results(project, jobs, self._forms)
         specimens: list[dict[str, Any]] = []
@@ -373,7 +373,9 @@ class Studio:
     async def _match_block(self, request: Request) -> Response:
         content = await json_body(request, _TABLE_BYTES)
         block = read(PastedBlock, content, "The pasted block", "copy the cells again")
-        return json_response(to_builtins(await run_in_threadpool(block.match, self._project.project.state)))
+        project = self._project.project
+        match = await run_in_threadpool(block.match, project.state)
+        return json_response({**to_builtins(match), "seen": project.revision})
 
     # Jobs
 
@@ -483,7 +485,7 @@ def _zip_files(folder: Path, paths: list[Path]) -> Generator[bytes]:
 
 
 def _revision(content: Mapping[str, Any]) -> int:
-    revision = content.get("revision")
+    revision = content.get("seen", content.get("revision"))
     if not isinstance(revision, int):
         raise HTTPException(400, "An edit needs the revision that it was made on.")
     return revision

@@ -6,12 +6,13 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 from shapespace.cohort.read import cohort_file_text
-from shapespace.cohort.table import Table, is_number
+from shapespace.cohort.table import Table, is_number, list_names
 from shapespace.errors import InputError, ShapespaceError
+from shapespace.schemas import CorrespondRecord
 from shapespace.statistics.compare_formula import design_of
 from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS
 from shapespace.viewer.studio.jobs import Job, Order
@@ -262,6 +263,13 @@ def checks(
     if drop_missing:
         chosen = [specimen for specimen in chosen if all(specimen.cells.get(column) for column in columns)]
     found = [{"level": "ok" if len(chosen) >= 2 else "problem", "text": f"Included specimens: {len(chosen)}."}]
+    if shapes is not None and shapes.kind in CORRESPONDENCES:
+        folder = project.folder / shapes.output
+        lacking = [one.id for one in chosen if not (folder / f"{one.id}{CorrespondRecord.SURFACE}").is_file()]
+        if lacking:
+            have = "has no surface" if len(lacking) == 1 else "have no surfaces"
+            text = f"{list_names(lacking)} {have} in {shapes.output} and cannot take part."
+            found.append({"level": "warning" if len(chosen) - len(lacking) >= 2 else "problem", "text": text})
     if kind == "score" and options.get("--reference"):
         members, others = map(len, _by_class(chosen, options["--reference"]))
         level = "problem" if members < 2 or not others else "warning" if members < 20 else "ok"
@@ -279,7 +287,14 @@ def checks(
             text = f"{column} is missing for {missing[column]} of {of_all} specimens; {what}."
             found.append({"level": "warning" if drop_missing else "problem", "text": text})
         classes = {cell: cells.count(cell) for cell in dict.fromkeys(cells) if cell}
-        if 0 < len(classes) <= 12:
+        decimals = [cell for cell in classes if re.fullmatch(r"-?\d+,\d+", cell)]
+        if decimals:
+            text = f"{column} has numbers with a decimal comma ({list_names(decimals)}); write a decimal point."
+            found.append({"level": "problem", "text": text})
+        elif len(classes) > 2 and all(map(is_number, classes)) and column != options.get("--group"):
+            numbers = sorted(map(float, classes))
+            found.append({"level": "ok", "text": f"{column}: numbers from {numbers[0]:g} to {numbers[-1]:g}."})
+        elif 0 < len(classes) <= 12:
             few = min(classes.values()) < 3
             text = f"{column}: {', '.join(f'{count} {name}' for name, count in classes.items())}."
             found.append({"level": "warning" if few else "ok", "text": text})
@@ -335,35 +350,38 @@ def outdated_results(project: Project, jobs: Sequence[Job], forms: Forms) -> dic
     done = [job for job in jobs if job.status == "done"]
     for job in done:
         earlier = [other for other in done if other.number < job.number]
-        sources = [other for other in earlier if other.output in job.arguments]
+        sources = [other for other in earlier if _reads(job, other.output)]
         redone = [other.output for other in done if other.kind == "redo" and other.number > job.number]
         if (
-            job.kind in _STUDY
-            and job.kind != "redo"
+            job.kind in (*_STUDY, "report")
+            and not (job.kind == "redo" or (job.kind == "report" and "--specimens" not in job.arguments))
             and (change := _change_since(project, earlier, forms, job, sources))
         ):
             found[job.number] = change
-        elif any(output in job.arguments and output != job.output for output in redone):
+        elif any(_reads(job, output) and output != job.output for output in redone):
             found[job.number] = "redone"
         elif any(source.number in found for source in sources):
             found[job.number] = "source"
     return found
 
 
+def _reads(job: Job, output: str) -> bool:
+    return any(word == output or word.startswith(f"{output}/") for word in job.arguments)
+
+
 def _change_since(
     project: Project, earlier: Sequence[Job], forms: Forms, job: Job, sources: Sequence[Job]
 ) -> Outdated | None:
-    on = job.on if job.on is not None or not sources else sources[-1].number
+    on = job.on if job.on is not None or not sources or job.kind == "report" else sources[-1].number
     try:
         now = order(project, earlier, forms, job.kind, job.options, on, job.number)
     except InputError:
-        return "specimens"
-    if (now.arguments, now.before) != (job.arguments, job.before):
+        moved = job.kind == "build" and bool(sources) and project.state.landmarks_on not in ("", sources[-1].output)
+        return "landmarks" if moved else "specimens"
+    is_each = job.kind in ("correspond", "fit", "complete")  # each scan has a result, also if others are excluded later
+    if now.arguments != job.arguments and job.kind != "report":
         has_marks = ["--landmarks" in arguments for arguments in (now.arguments, job.arguments)]
         return "landmarks" if has_marks[0] != has_marks[1] else "specimens"
-    used = {"id", "file"} if now.before or job.kind in ("correspond", "fit", "complete") else {
-        "specimen", *_used_columns(project.state.columns, job.options)
-    }  # fmt: skip
     for name, content in now.files.items():
         try:
             before = (project.folder / name).read_text(encoding="utf-8")
@@ -372,8 +390,14 @@ def _change_since(
         if name.endswith("-landmarks.csv"):
             if content != before:
                 return "landmarks"
-        elif name.endswith(".csv") and (rows := _rows_of(content, used)) != (rows_before := _rows_of(before, used)):
-            return "table" if [row[:1] for row in rows] == [row[:1] for row in rows_before] else "specimens"
+        elif name.endswith(".csv"):
+            columns = {*project.state.columns, *next(csv.reader(io.StringIO(before)))}
+            used = {"id", "file"} if is_each else {"specimen", "subject", *_used_columns(sorted(columns), job.options)}
+            used = columns if job.kind == "report" else used
+            rows, rows_before = _rows_of(content, used), _rows_of(before, used)
+            if rows != rows_before and not (is_each and all(row in rows_before for row in rows)):
+                is_same = not is_each and [row[:1] for row in rows] == [row[:1] for row in rows_before]
+                return "table" if is_same else "specimens"
     return None
 
 
@@ -388,7 +412,7 @@ def _used_columns(columns: Sequence[str], options: Mapping[str, Any]) -> list[st
     """Return the columns of the table that the options of a question name."""
     formula = f"{options.get('--formula', '')} {options.get('--covariates', '')}"
     texts = [value for value in options.values() if isinstance(value, str)]
-    used = {part for text in texts for part in (text, text.partition("=")[0], *text.split(","))}
+    used = {part.strip() for text in texts for part in (text, *re.split(r"[,!?=]", text))}
     return [column for column in columns if column in used or _in_formula(column, formula)]
 
 
@@ -425,11 +449,13 @@ def _require_specimens(specimens: Sequence[Specimen], purpose: str, least: int) 
 
 def _surfaces(project: Project, before: Job) -> list[str]:
     """Return the folder in correspondence, or the surfaces of the included specimens if others are excluded."""
-    chosen = [f"{before.output}/{specimen.id}.ply" for specimen in project.state.chosen("training")]
-    there = [path for path in chosen if (project.folder / path).is_file()]
-    made = {path.stem for path in (project.folder / before.output).glob("*.ply")}
-    excluded = [specimen for specimen in project.state.specimens if not specimen.included and specimen.id in made]
-    if excluded:
+
+    def paths(specimens: Iterable[Specimen]) -> list[str]:
+        files = [f"{before.output}/{specimen.id}{CorrespondRecord.SURFACE}" for specimen in specimens]
+        return [file for file in files if (project.folder / file).is_file()]
+
+    there = paths(project.state.chosen("training"))
+    if paths(specimen for specimen in project.state.specimens if not specimen.included):
         if len(there) < 2:
             raise InputError("Fewer than two included specimens are in correspondence; include more.")
         return there

@@ -34,6 +34,7 @@ _AGAIN = "restore it from a copy, or start a new project"
 _MOST_CLASSES = 12  # classes of a column that the page counts
 _MOST_UNDONE = 100  # edits that can be undone
 _LONGEST_ID, _LONGEST_CELL = 100, 1000  # characters
+_DECIMAL_COMMA = re.compile(r"-?\d+,\d+")
 _NO_FILE_NAME = re.compile(r'[/\\:*?"<>|\x00-\x1f]')
 STALE = "Another tab changed the project; look at it and do it again."
 
@@ -427,12 +428,20 @@ class PastedBlock(Struct, frozen=True, kw_only=True):
         if not has_heading and self.column and not (has_names and width > 1):
             return self._by_position(rows, columns)
         heads = rows[0][1:]
-        is_new = not self.column and not named[0] and any(named) and not any(map(is_number, heads))
+        is_new = not named[0] and any(named) and not any(map(is_number, heads))
         has_heads = all(heads) and len(set(heads)) == len(heads) and (is_new or set(heads) <= set(state.columns))
         header = rows.pop(0) if has_heading or has_heads else ["", *(columns if self.column else state.columns)]
-        return self._by_name(header if has_heading else [KEYS[0], *header[1:]], rows, state, is_sure=has_heading)
+        return self._by_name(
+            header if has_heading else [KEYS[0], *header[1:]],
+            rows,
+            state,
+            is_sure=has_heading,
+            is_asked=bool(self.column),
+        )
 
-    def _by_name(self, header: list[str], rows: list[list[str]], state: State, *, is_sure: bool) -> MatchedBlock:
+    def _by_name(
+        self, header: list[str], rows: list[list[str]], state: State, *, is_sure: bool, is_asked: bool
+    ) -> MatchedBlock:
         width = max(map(len, self.rows))
         text = io.StringIO()
         csv.writer(text, delimiter="\t").writerows([header[:width], *(row[: len(header)] for row in rows)])
@@ -440,7 +449,11 @@ class PastedBlock(Struct, frozen=True, kw_only=True):
         new = tuple(column for column in pasted if column not in state.columns)
         notes += _beyond(width - len(header), "column")
         return MatchedBlock(
-            columns=new, cells=cells, by_name=True, certain=not notes and (is_sure or not new), notes=tuple(notes)
+            columns=new,
+            cells=cells,
+            by_name=True,
+            certain=not notes and (is_sure or not (new or is_asked)),
+            notes=tuple(notes),
         )
 
     def _by_position(self, rows: list[list[str]], columns: list[str]) -> MatchedBlock:
@@ -450,6 +463,11 @@ class PastedBlock(Struct, frozen=True, kw_only=True):
             rows = rows[1:]
         notes += [*_beyond(len(rows) - len(self.order), "row"), *_beyond(len(rows[0]) - len(columns), "column")]
         cells = {name: dict(zip(columns, row, strict=False)) for name, row in zip(self.order, rows, strict=False)}
+        for column in columns:
+            values = [own[column] for own in cells.values() if column in own]
+            for own in cells.values():
+                if column in own:
+                    own[column] = _with_point(own[column], values)
         return MatchedBlock(cells=cells, by_name=False, certain=not notes and len(rows) == 1, notes=tuple(notes))
 
 
@@ -492,7 +510,9 @@ def _edit_cells(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
     stored = {specimen.id: specimen.cells for specimen in state.specimens}
     for cell in request["cells"]:
         _check_column(state, cell["column"])
-        by_id.setdefault(cell["id"], {})[cell["column"]] = str(cell["value"]).strip()[:_LONGEST_CELL]
+        others = (cells.get(cell["column"], "") for name, cells in stored.items() if name != cell["id"])
+        value = _with_point(str(cell["value"]).strip()[:_LONGEST_CELL], others)
+        by_id.setdefault(cell["id"], {})[cell["column"]] = value
         now = stored.get(cell["id"], {}).get(cell["column"], "")
         if now != cell.get("before", now):
             raise StaleError(
@@ -566,9 +586,20 @@ def _rename(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
 
 def _add_column(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
     column = str(request["column"]).strip()[:60]
-    if not column or key_column([column]) is not None or column in state.columns:
+    if not column or not _can_be_column(column) or column in state.columns:
         raise InputError(f"A column cannot be called {column!r}; choose a name that is not in use.")
     return f"add the column {column}", replace(state, columns=(*state.columns, column))
+
+
+def _can_be_column(name: str) -> bool:
+    """Return whether a column can have a name: it names no specimens, is no term of formulas, and can be quoted."""
+    return key_column([name]) is None and name != "log_size" and "`" not in name
+
+
+def _with_point(value: str, others: Iterable[str]) -> str:
+    """Return a cell with a decimal point for a comma if the `others` of its column are numbers, as tables are read."""
+    plain = value.replace(",", ".") if _DECIMAL_COMMA.fullmatch(value) else value
+    return plain if plain != value and all(is_number(cell.replace(",", ".")) for cell in others if cell) else value
 
 
 def _remove_column(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
@@ -602,13 +633,18 @@ def cells_of_table(
         InputError: no row is of a specimen.
     """
     table = read_table(Path(name), content)
+    reserved = [head for head in table.columns if not _can_be_column(head)]
     named = [(specimen.id, *names_of_file(Path(specimen.file).name)) for specimen in state.specimens]
     matched, notes = match_rows(table, named, "the project", "name the specimens alike")
     cells = {
-        state.specimens[k].id: {head: column[row][:_LONGEST_CELL] for head, column in table.columns.items()}
+        state.specimens[k].id: {
+            head: column[row][:_LONGEST_CELL] for head, column in table.columns.items() if head not in reserved
+        }
         for row, k in matched.items()
     }
-    return list(table.columns), cells, notes
+    if reserved:
+        notes.append(f"Not taken, as these names have a meaning of their own: {', '.join(reserved)}; rename them.")
+    return [head for head in table.columns if head not in reserved], cells, notes
 
 
 def with_cells(columns: Sequence[str], cells: Mapping[str, Mapping[str, str]]) -> Callable[[State], tuple[str, State]]:

@@ -18,10 +18,9 @@ from shapespace.batch.workers import context, end_after
 from shapespace.errors import FileError, InputError, ShapespaceError
 from shapespace.geometry.doctor import examine_and_repair
 from shapespace.geometry.mirror_plane import mirror_image
-from shapespace.geometry.normals import boundary_edges
+from shapespace.geometry.normals import boundary_edges, drawable
 from shapespace.io.files import write_bytes, write_text
 from shapespace.io.meshes.mesh_io import read_mesh
-from shapespace.report.inputs.correspondence_folder import drawable
 from shapespace.report.render.scene import decimate, pack
 from shapespace.report.render.thumbnails import mesh_still
 from shapespace.types import Mesh
@@ -94,9 +93,10 @@ class SpecimenChecks:
         def done(future: Future[dict[str, Any]]) -> None:
             if future.cancelled():
                 return
-            if future.exception() is not None:
-                self._known[key] = self._facts_of_failure(future.exception())
-            if key in self._known or future.result()["state"] == "unusable":
+            failure = future.exception()
+            if failure is not None:
+                self._known[key] = self._facts_of_failure(failure)
+            if failure is not None or future.result()["state"] == "unusable":
                 # On a full disk the scan stays included; commands reject it.
                 with contextlib.suppress(FileError):
                     self._unusable(scan)
