@@ -265,7 +265,9 @@ def checks(
     found = [{"level": "ok" if len(chosen) >= 2 else "problem", "text": f"Included specimens: {len(chosen)}."}]
     if shapes is not None and shapes.kind in CORRESPONDENCES:
         folder = project.folder / shapes.output
-        lacking = [one.id for one in chosen if not (folder / f"{one.id}{CorrespondRecord.SURFACE}").is_file()]
+        lacking = [
+            specimen.id for specimen in chosen if not (folder / f"{specimen.id}{CorrespondRecord.SURFACE}").is_file()
+        ]
         if lacking:
             have = "has no surface" if len(lacking) == 1 else "have no surfaces"
             text = f"{list_names(lacking)} {have} in {shapes.output} and cannot take part."
