@@ -57,7 +57,7 @@ def report(
     inputs = [path.resolve() for path in (*results, *([] if specimens is None else [specimens]))]
     if output is not None and (output.suffix.lower() not in (".html", ".htm") or output.resolve() in inputs):
         raise InputError(f"{output} cannot be the file of the report; give a name that ends in .html.")
-    if len(results) == 1 and specimens is None and results[0].suffix != ".h5":
+    if len(results) == 1 and specimens is None and not results[0].is_file():
         page = write_report(results[0], output, model=model, labels=labels, quiet=quiet)
     elif model is not None or labels is not None:
         raise InputError("--model and --labels are of one folder of fits; omit them, or give that folder alone.")

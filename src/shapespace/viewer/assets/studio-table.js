@@ -69,7 +69,7 @@
       set(null);
       onblock(rows);
     };
-    return html`<td><input class="entry" size="8" aria-label=${label} data-testid=${testid} data-row=${row} data-column=${column} value=${draft === null ? value : draft} readonly=${Studio.state.read_only}
+    return html`<td><input class="entry" size="8" aria-label=${label} data-testid=${testid} data-row=${row} data-column=${column} value=${draft === null ? value : draft} title=${value} readonly=${Studio.state.read_only}
       data-edited=${draft !== null} oninput=${(event) => set(event.target.value)} onblur=${send} onkeydown=${key} onpaste=${paste} /></td>`;
   }
 

@@ -448,6 +448,8 @@ class PastedBlock(Struct, frozen=True, kw_only=True):
         pasted, cells, notes = cells_of_table(text.getvalue().encode(), state, "The pasted block")
         new = tuple(column for column in pasted if column not in state.columns)
         notes += _beyond(width - len(header), "column")
+        names = {fold_name(column) for column in state.columns}
+        is_sure = is_sure and not any(fold_name(column) in names for column in new)
         return MatchedBlock(
             columns=new,
             cells=cells,
