@@ -7,6 +7,8 @@
   const TABS = ["model", "compare", "fits", "scan"];
 
   window.shapespaceReady = false;
+
+  let isChosen = false; // whether the user chose a tab before the fits were there
   window.shapespaceTimes = []; // ms from a slider's event to the picture, as drawn
 
   function show(name) {
@@ -41,7 +43,7 @@
 
   function startTabs() {
     for (const tab of TABS) {
-      $(`tab-${tab}`).addEventListener("click", () => show(tab));
+      $(`tab-${tab}`).addEventListener("click", () => { isChosen = true; show(tab); });
       $(`tab-${tab}`).addEventListener("keydown", (event) => {
         const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
         if (!step) return;
@@ -82,7 +84,7 @@
     $("loading").hidden = true;
     if (!stage.a.works) ready();
     await fitsTab.start();
-    if (about.has_fits) show("fits");
+    if (about.has_fits && !isChosen) show("fits");
     await uploads.start();
   }
 
