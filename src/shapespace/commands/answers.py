@@ -62,7 +62,8 @@ def report(
     elif model is not None or labels is not None:
         raise InputError("--model and --labels are of one folder of fits; omit them, or give that folder alone.")
     elif output is None:
-        raise InputError("Name the file of the report, such as -o report.html.")
+        names = ", ".join(map(str, results[:3]))
+        raise InputError(f"Name the file of the report on {names}, such as -o report.html.")
     else:
         with drawing(quiet=quiet) as step:
             page = write_study_report(results, output, specimens=specimens, on_step=step)
