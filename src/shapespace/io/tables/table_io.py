@@ -31,7 +31,8 @@ _FORMULA = re.compile(r"'*[=+\-@\t\r]")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|[+-]?(inf|nan)")
 _DELIMITERS = (",", ";", "\t")
 _INTEGER = re.compile(r"[+-]?[0-9]+([eE][+-]?[0-9]+)?")
-_DECIMAL_COMMA = re.compile(r"[+-]?[0-9]*,[0-9]+([eE][+-]?[0-9]+)?")
+DECIMAL_COMMA = re.compile(r"[+-]?[0-9]*,[0-9]+([eE][+-]?[0-9]+)?")
+"""A number with a decimal comma."""
 _THOUSANDS = re.compile(r"[+-]?[0-9]{1,3}(\.[0-9]{3})+,[0-9]+")
 _MOST_LACKING = 2**18
 """Limit of the total number of missing cells of all rows; filling them takes memory beyond the size of the file."""
@@ -228,10 +229,10 @@ def _with_decimal_points(lines: list[list[str]]) -> list[list[str]]:
     """
     for column, name in enumerate(lines[0] if lines else []):
         cells = {number: line[column].strip() for number, line in enumerate(lines) if column < len(line)}
-        if not _DECIMAL_COMMA.fullmatch(cells[0]):
+        if not DECIMAL_COMMA.fullmatch(cells[0]):
             del cells[0]
         cells = {number: cell for number, cell in cells.items() if cell.lower() not in MISSING}
-        with_comma = [n for n, cell in cells.items() if _DECIMAL_COMMA.fullmatch(cell) or _THOUSANDS.fullmatch(cell)]
+        with_comma = [n for n, cell in cells.items() if DECIMAL_COMMA.fullmatch(cell) or _THOUSANDS.fullmatch(cell)]
         other_cells = [cell for number, cell in cells.items() if number not in set(with_comma)]
         if not with_comma or not all(_NUMBER.fullmatch(cell) for cell in other_cells):
             continue

@@ -6,12 +6,13 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Literal
 
 from shapespace.cohort.read import cohort_file_text
 from shapespace.cohort.table import Table, is_number, list_names
 from shapespace.errors import InputError, ShapespaceError
+from shapespace.io.tables.table_io import DECIMAL_COMMA
 from shapespace.schemas import CorrespondRecord
 from shapespace.statistics.compare_formula import design_of
 from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS
@@ -176,12 +177,11 @@ def _question(
     if kind == "score":
         reference, others = _by_class(chosen, options.get("--reference"))
         reference_table, population = f"{stem}-reference.csv", f"{stem}-reference.toml"
-        inputs = project.folder / _INPUTS
         files = {
             f"{stem}.csv": project.table(_require_specimens(others, "to score", 1)),
             reference_table: project.table(_require_specimens(reference, "in the reference", 2)),
             population: cohort_file_text(
-                inputs, project.folder / reference_table, shapes=project.folder / shapes.output
+                project.folder / _INPUTS, project.folder / reference_table, shapes=project.folder / shapes.output
             ),
         }
         given = [word for word in given if not word.startswith("--reference=")]
@@ -264,10 +264,8 @@ def checks(
         chosen = [specimen for specimen in chosen if all(specimen.cells.get(column) for column in columns)]
     found = [{"level": "ok" if len(chosen) >= 2 else "problem", "text": f"Included specimens: {len(chosen)}."}]
     if shapes is not None and shapes.kind in CORRESPONDENCES:
-        folder = project.folder / shapes.output
-        lacking = [
-            specimen.id for specimen in chosen if not (folder / f"{specimen.id}{CorrespondRecord.SURFACE}").is_file()
-        ]
+        there = _surface_files(project, shapes, chosen)
+        lacking = [specimen.id for specimen in chosen if specimen.id not in there]
         if lacking:
             have = "has no surface" if len(lacking) == 1 else "have no surfaces"
             text = f"{list_names(lacking)} {have} in {shapes.output} and cannot take part."
@@ -289,7 +287,7 @@ def checks(
             text = f"{column} is missing for {missing[column]} of {of_all} specimens; {what}."
             found.append({"level": "warning" if drop_missing else "problem", "text": text})
         classes = {cell: cells.count(cell) for cell in dict.fromkeys(cells) if cell}
-        decimals = [cell for cell in classes if re.fullmatch(r"-?\d+,\d+", cell)]
+        decimals = [cell for cell in classes if DECIMAL_COMMA.fullmatch(cell)]
         if decimals:
             text = f"{column} has numbers with a decimal comma ({list_names(decimals)}); write a decimal point."
             found.append({"level": "problem", "text": text})
@@ -388,7 +386,7 @@ def _change_since(
         try:
             before = (project.folder / name).read_text(encoding="utf-8")
         except OSError:
-            continue  # whoever removed it knows
+            continue  # the file was removed, so there is nothing to compare
         if name.endswith("-landmarks.csv"):
             if content != before:
                 return "landmarks"
@@ -451,17 +449,19 @@ def _require_specimens(specimens: Sequence[Specimen], purpose: str, least: int) 
 
 def _surfaces(project: Project, before: Job) -> list[str]:
     """Return the folder in correspondence, or the surfaces of the included specimens if others are excluded."""
+    excluded = [specimen for specimen in project.state.specimens if not specimen.included]
+    if not _surface_files(project, before, excluded):
+        return [before.output]
+    included = _surface_files(project, before, project.state.chosen("training"))
+    if len(included) < 2:
+        raise InputError("Fewer than two included specimens are in correspondence; include more.")
+    return list(included.values())
 
-    def paths(specimens: Iterable[Specimen]) -> list[str]:
-        files = [f"{before.output}/{specimen.id}{CorrespondRecord.SURFACE}" for specimen in specimens]
-        return [file for file in files if (project.folder / file).is_file()]
 
-    there = paths(project.state.chosen("training"))
-    if paths(specimen for specimen in project.state.specimens if not specimen.included):
-        if len(there) < 2:
-            raise InputError("Fewer than two included specimens are in correspondence; include more.")
-        return there
-    return [before.output]
+def _surface_files(project: Project, shapes: Job, specimens: Sequence[Specimen]) -> dict[str, str]:
+    """Return id -> path in the project's folder of the surface in correspondence, of the specimens that have one."""
+    paths = {specimen.id: f"{shapes.output}/{specimen.id}{CorrespondRecord.SURFACE}" for specimen in specimens}
+    return {name: path for name, path in paths.items() if (project.folder / path).is_file()}
 
 
 def _model_ending(name: str) -> str:

@@ -24,7 +24,7 @@ from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.containers.json_files import read_json
 from shapespace.io.files import atomic_path, make_folder, write_error, write_text
 from shapespace.io.meshes.mesh_io import MESH_FILE_ENDINGS, mesh_files, stem_of
-from shapespace.io.tables.table_io import KEYS, key_column, table_text
+from shapespace.io.tables.table_io import DECIMAL_COMMA, KEYS, key_column, table_text
 from shapespace.schemas import json_text, read
 from shapespace.types import MM_PER_UNIT
 
@@ -34,7 +34,6 @@ _AGAIN = "restore it from a copy, or start a new project"
 _MOST_CLASSES = 12  # classes of a column that the page counts
 _MOST_UNDONE = 100  # edits that can be undone
 _LONGEST_ID, _LONGEST_CELL = 100, 1000  # characters
-_DECIMAL_COMMA = re.compile(r"-?\d+,\d+")
 _NO_FILE_NAME = re.compile(r'[/\\:*?"<>|\x00-\x1f]')
 STALE = "Another tab changed the project; look at it and do it again."
 
@@ -600,7 +599,7 @@ def _can_be_column(name: str) -> bool:
 
 def _with_point(value: str, others: Iterable[str]) -> str:
     """Return a cell with a decimal point for a comma if the `others` of its column are numbers, as tables are read."""
-    plain = value.replace(",", ".") if _DECIMAL_COMMA.fullmatch(value) else value
+    plain = value.replace(",", ".") if DECIMAL_COMMA.fullmatch(value) else value
     return plain if plain != value and all(is_number(cell.replace(",", ".")) for cell in others if cell) else value
 
 
