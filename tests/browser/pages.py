@@ -52,6 +52,10 @@ class World:
         return self.home / "scans" / "broken.ply"
 
 
+PANE = "document.querySelector('[data-testid=pane]')"
+"""JavaScript: the part of the page that shows a result; its `shadowRoot` has the elements."""
+
+
 def hear_signals() -> None:
     """Undo what nohup or a background shell hands down, so that the viewer is stopped as at a terminal."""
     for one in (signal.SIGHUP, signal.SIGINT):
@@ -72,11 +76,9 @@ def viewer(path: Path, how: signal.Signals = signal.SIGINT) -> Iterator[str]:
             assert process.stdout is not None
             line = process.stdout.readline()
             assert "http://127.0.0.1" in line, line
-            stores_scans = not (path / "correspondence.json").is_file()
-            assert len(list(Path(temporary).glob("shapespace-view-*"))) == stores_scans
             yield line[line.index("http") :].strip()
         finally:
             process.send_signal(how)
             process.communicate(timeout=20)
-        assert not list(Path(temporary).glob("shapespace-view-*"))
+        assert not list(Path(temporary).glob("shapespace-*"))
         assert process.returncode in (0, 128 + signal.SIGINT, 128 + signal.SIGTERM)

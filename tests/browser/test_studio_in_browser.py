@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from pages import hear_signals
+from pages import PANE, hear_signals
 from pictures import change, drawn_share, same_as_kept
 
 from shapespace.cli import main
@@ -40,8 +40,8 @@ def studio(project: Path | None, home: Path, name: str = "studio") -> Iterator[s
 
 
 def barriers(tab) -> list[str]:
-    """Return what axe calls a serious barrier on the page; frames are pages of their own."""
-    found = Axe().run(tab.page, context={"exclude": [["iframe"]]}).response["violations"]
+    """Return what axe calls a serious barrier on the page."""
+    found = Axe().run(tab.page).response["violations"]
     return [
         f"{one['id']}: {one['nodes'][0]['html'][:120]}" for one in found if one["impact"] in ("serious", "critical")
     ]
@@ -65,19 +65,12 @@ class User:
         self.tab.until(f"{state} === true", seconds)
 
 
-_DRAWN = (
-    "document.readyState === 'complete' && (document.body.dataset.ready === 'true' || "
-    "!document.getElementById('loading') && !!document.querySelector('h1 + *')) && "
-    "[...(window.Shapespace?.sceneParts?.views || [])].every((view) => view.rests)"
-)
-
-
-def framed(tab, seconds: float = 60.0) -> None:
-    """Wait until the page in the frame has drawn."""
-    end = time.monotonic() + seconds
-    while not any("/view/" in frame.url and frame.evaluate(_DRAWN) for frame in tab.page.frames[1:]):
-        assert time.monotonic() < end
-        tab.page.wait_for_timeout(100)
+def has_drawn(tab, seconds: float = 60.0) -> None:
+    """Wait until the result has drawn."""
+    tab.until(
+        f"{PANE}?.dataset.ready === 'true' && [...window.Shapespace.sceneParts.views].every((view) => view.rests)",
+        seconds,
+    )
 
 
 def place_and_drag(tab, project: Path) -> None:
@@ -90,37 +83,34 @@ def place_and_drag(tab, project: Path) -> None:
             tab.page.wait_for_timeout(100)
         return marks["tip"]
 
-    frame = tab.page.frame_locator("[data-testid=frame]")
     tab.page.get_by_test_id("landmarks").locator("summary").click()
-    box = frame.get_by_test_id("view-1").bounding_box()
+    box = tab.page.get_by_test_id("view-1").bounding_box()
     tab.page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     tab.page.get_by_test_id("landmark-name").fill("tip")
     tab.page.get_by_test_id("landmark-add").click()
     before = stored()
-    frame.get_by_test_id("clear").click()
+    tab.page.get_by_test_id("clear").click()
     tab.page.wait_for_timeout(500)
-    cell = next(one for one in tab.page.frames if "/view/" in one.url)
-    x, y = cell.evaluate(
+    x, y = tab.page.evaluate(
         "(() => { const v = window.shapespaceCells[2].view, b = v.canvas.getBoundingClientRect();"
         "const [x, y] = v.project(v._marks.get('marks')[0].position); return [b.left + x, b.top + y]; })()"
     )
-    outer = tab.page.get_by_test_id("frame").bounding_box()
-    tab.page.mouse.move(outer["x"] + x, outer["y"] + y)
+    tab.page.mouse.move(x, y)
     tab.page.mouse.down()
-    tab.page.mouse.move(outer["x"] + x, outer["y"] + y + 25, steps=4)
+    tab.page.mouse.move(x, y + 25, steps=4)
     tab.page.mouse.up()
     tab.until(f"document.querySelector('[data-testid=landmark-vertex-tip]').value !== '{before}'")
     assert stored() != before
 
 
 def exclude_in_morphospace(tab, user: User, project: Path) -> None:
-    """Select a specimen in the morphospace in the frame, and exclude it by the bar of the page."""
+    """Select a specimen in the morphospace, and exclude it by the bar of the page."""
     tab.page.get_by_test_id("tab-model").click()
     tab.page.get_by_test_id("more-morphospace").locator("summary").first.click()
     user.click("run-morphospace")
     user.has_run(4)
-    framed(tab)
-    widget = tab.page.frame_locator("[data-testid=frame]").locator("figure.turning .widget")
+    has_drawn(tab)
+    widget = tab.page.get_by_test_id("pane").locator("figure.turning .widget")
     widget.scroll_into_view_if_needed()
     widget.locator("select").nth(2).select_option("7")
     widget.get_by_role("button", name="Select this shape").press("Enter")
@@ -208,7 +198,7 @@ def test_raw_scans_become_a_report_by_clicks_and_history_gives_the_same_numbers(
             tab.page.get_by_test_id("option--rounds").fill("1")
         user.click("run-correspond")
         user.has_run(1)
-        framed(tab)
+        has_drawn(tab)
         shot = tab.shot("correspondence")
         if count == 12:
             same_as_kept("screen-correspondence.png", shot, width=1200)
@@ -217,7 +207,7 @@ def test_raw_scans_become_a_report_by_clicks_and_history_gives_the_same_numbers(
         user.click("next")
         user.click("run-build")
         user.has_run(2)
-        framed(tab)
+        has_drawn(tab)
         tab.shot("model")
         assert barriers(tab) == []
         user.click("next")
@@ -229,7 +219,7 @@ def test_raw_scans_become_a_report_by_clicks_and_history_gives_the_same_numbers(
         user.has_run(3)
         user.sees("sentences")
         assert "group" in tab.page.get_by_test_id("sentences").inner_text()
-        framed(tab)
+        has_drawn(tab)
         shot = tab.shot("answer")
         if count == 12:
             same_as_kept("screen-answer.png", shot, width=1200)
@@ -253,7 +243,7 @@ def test_raw_scans_become_a_report_by_clicks_and_history_gives_the_same_numbers(
             seen.page.get_by_test_id("tab-questions").click()
             seen.page.get_by_test_id("earlier-3").click()
             User(seen).sees("sentences")
-            framed(seen)
+            has_drawn(seen)
             seen.shot("read-only")
             assert seen.page.locator("[data-testid^=outdated]").count() == 0
             assert seen.page.get_by_test_id("form-compare").count() == 0
@@ -381,7 +371,7 @@ def test_a_run_goes_on_when_the_server_is_killed_and_the_tab_closed(open_tab, tm
         User(tab).sees("tab-correspondence")
         tab.page.get_by_test_id("tab-correspondence").click()
         User(tab).has_run(1)
-        framed(tab)
+        has_drawn(tab)
         assert tab.page.get_by_test_id("job-1").get_attribute("data-status") == "done"
         assert tab.complaints == []
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from pages import ONE_WINDOW, WINDOWS, viewer
+from pages import ONE_WINDOW, PANE, WINDOWS, viewer
 from pictures import change, drawn_share
 
 from same_blobs import FOLDED, HIDDEN, NAMES, write_same
@@ -25,10 +25,10 @@ def address(same: Path) -> Iterator[str]:
 
 
 def ready(tab, sides: int = 1):
-    tab.until("window.shapespaceReady === true")
+    tab.until(f"{PANE}?.dataset.ready === 'true'")
     if sides == 1:
         tab.page.get_by_test_id("sides-1").click()
-        tab.until("document.getElementById('which').textContent === '1 to 11 of 15'")
+        tab.until(f"{PANE}.shadowRoot.getElementById('which').textContent === '1 to 11 of 15'")
         tab.until("window.shapespaceCells[11].positions !== null")
     tab.page.wait_for_timeout(700)
     return tab
@@ -82,7 +82,7 @@ def test_surfaces_open_on_both_sides_with_their_worst_places(open_tab, address: 
     )
     front, back = tab.page.evaluate(f"{depths}(window.shapespaceCells[2])")
     assert front > 0 > back, "the click was on the side that the front view does not show"
-    tab.until(f"document.querySelector('[data-testid=faults-fold]')?.innerText.includes('{FOLDED}')")
+    tab.until(f"{PANE}.shadowRoot.querySelector('[data-testid=faults-fold]')?.innerText.includes('{FOLDED}')")
     worst = tab.page.get_by_test_id("faults-fold").get_by_role("button").first
     assert FOLDED in worst.inner_text() and "folded triangle" in worst.inner_text()
     worst.click()
@@ -149,7 +149,7 @@ def test_pages_filters_and_numbers_that_are_no_vertex(open_tab, address: str) ->
     tab.page.get_by_test_id("number").fill("5")
     tab.page.get_by_test_id("mark").click()
     tab.page.get_by_test_id("next").click()
-    tab.until("document.getElementById('which').textContent === '12 to 15 of 15'")
+    tab.until(f"{PANE}.shadowRoot.getElementById('which').textContent === '12 to 15 of 15'")
     tab.until("window.shapespaceCells[4].name.textContent === 'more08'")
     assert tab.page.locator(".cell:visible").count() == 5
     assert marked(tab, 4) == [5], "marks stay from page to page"
@@ -160,7 +160,7 @@ def test_pages_filters_and_numbers_that_are_no_vertex(open_tab, address: str) ->
     tab.page.get_by_test_id("filter").fill("stranger")
     assert "excluded" in tab.page.get_by_test_id("list").inner_text()
     tab.page.get_by_test_id("filter").fill("able")
-    tab.until("document.getElementById('which').textContent === '1 to 1 of 1'")
+    tab.until(f"{PANE}.shadowRoot.getElementById('which').textContent === '1 to 1 of 1'")
     tab.page.get_by_test_id("number").fill("600")
     tab.page.get_by_test_id("mark").click()
     assert "The vertices have the numbers 0 to 599" in tab.page.get_by_test_id("message").inner_text()

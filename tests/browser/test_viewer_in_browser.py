@@ -1,9 +1,7 @@
-"""The viewer as a user meets it: sliders, a dropped scan, a verdict, files to take away."""
+"""The view of a model and of fits as a user meets it: sliders, distances, charts, files to take away."""
 
-import base64
 import csv
 import io
-import json
 import re
 import shutil
 import signal
@@ -12,14 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pages import DESKTOP, ONE_WINDOW, PHONE, World, viewer
+from pages import DESKTOP, ONE_WINDOW, PANE, PHONE, World, viewer
 from pictures import change, drawn_share, same_as_kept
 
 from shapespace.batch.fit_records import read_record
 from shapespace.cli import main
 from shapespace.io.meshes.mesh_io import read_mesh
 
-VERDICT_MS = 120_000
 MOVE = "(slider, value) => { slider.value = value; slider.dispatchEvent(new Event('input', {bubbles: true})); }"
 
 
@@ -35,7 +32,7 @@ def test_a_viewer_whose_terminal_is_closed_leaves_nothing_behind(world: World) -
 
 
 def ready(tab, part: str = "model"):
-    tab.until("window.shapespaceReady === true")
+    tab.until(f"{PANE}?.dataset.ready === 'true'")
     tab.page.get_by_test_id(f"tab-{part}").click()
     return tab
 
@@ -44,30 +41,12 @@ def view(tab) -> bytes:
     # What is drawn coarsely while it moves is drawn finely at rest.
     # A change takes effect in the next frame.
     tab.page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
-    tab.until("document.getElementById('loading').hidden && window.shapespaceStage.a.rests")
+    tab.until(f"{PANE}.shadowRoot.getElementById('loading').hidden && window.shapespaceStage.a.rests")
     return tab.page.get_by_test_id("view").screenshot()
 
 
 def slide(tab, mode: int, value: float) -> None:
     tab.page.get_by_test_id(f"mode-{mode}").evaluate(MOVE, value)
-
-
-def drop(tab, *paths: Path) -> None:
-    data = tab.page.evaluate_handle(
-        """(files) => { const t = new DataTransfer();
-        for (const [name, content] of files) {
-          t.items.add(new File([Uint8Array.from(atob(content), c => c.charCodeAt(0))], name));
-        } return t; }""",
-        [[path.name, base64.b64encode(path.read_bytes()).decode()] for path in paths],
-    )
-    for event in ("dragenter", "dragover", "drop"):
-        tab.page.dispatch_event("body", event, {"dataTransfer": data})
-
-
-def verdict(tab) -> str:
-    card = tab.page.get_by_test_id("scan-status")
-    card.wait_for(state="visible", timeout=VERDICT_MS)
-    return card.get_attribute("data-status")
 
 
 @pytest.mark.parametrize(("viewport", "scheme"), ONE_WINDOW)
@@ -157,7 +136,7 @@ def test_saved_fits_come_doubtful_ones_first_and_step_through(open_tab, address:
     assert any("broken" in detail for detail in seen)
     assert not any("Converged; robust residual SD" in detail for detail in seen)
     tab.page.locator('[data-testid="fit"][data-name="holes"]').click()
-    tab.until("document.getElementById('caption-a').textContent.startsWith('holes')")
+    tab.until(f"{PANE}.shadowRoot.getElementById('caption-a').textContent.startsWith('holes')")
     told = tab.page.get_by_test_id("fit-detail").get_by_test_id("shown").inner_text()
     assert "mean where the scan shows it" in told and "mean where the model covers it" in told
     shown = view(tab)
@@ -187,7 +166,7 @@ DRAWN = """(chart) => {
 def test_charts_show_the_iterations_and_the_coefficients(open_tab, address: str, world: World, scheme: str) -> None:
     tab = ready(open_tab(address, scheme=scheme, device_scale_factor=2), "fits")
     tab.page.locator('[data-testid="fit"][data-name="plain"]').click()
-    tab.until("document.getElementById('caption-a').textContent.startsWith('plain')")
+    tab.until(f"{PANE}.shadowRoot.getElementById('caption-a').textContent.startsWith('plain')")
     detail, moment = tab.page.get_by_test_id("fit-detail"), tab.page.get_by_test_id("fit-moment")
     rms, bars = detail.get_by_role("img", name="RMS distance by"), detail.get_by_role("img", name="Coefficients in")
     last = int(moment.get_attribute("max"))
@@ -226,7 +205,7 @@ def test_charts_show_the_iterations_and_the_coefficients(open_tab, address: str,
     assert both.get_attribute("data-points") == str(2 * K)
     assert both.locator(".u-legend .u-label").all_inner_texts() == ["from", "to"]
     tab.page.set_viewport_size(PHONE)
-    chart = "document.getElementById('compare-chart')"
+    chart = f"{PANE}.shadowRoot.getElementById('compare-chart')"
     tab.until(f"{chart}.querySelector('canvas').clientWidth === {chart}.clientWidth")
     tab.shot(f"phone-{scheme}")
     assert tab.complaints == []
@@ -243,61 +222,13 @@ def test_fits_without_stages_are_drawn_and_one_without_its_scan_says_so(open_tab
         tab.page.get_by_test_id("tab-fits").click()
         for name, alone in (("plain", False), ("holes", True)):
             tab.page.locator(f'[data-testid="fit"][data-name="{name}"]').click()
-            tab.until(f"document.getElementById('caption-a').textContent === '{name}. The fitted model'")
+            tab.until(f"{PANE}.shadowRoot.getElementById('caption-a').textContent === '{name}. The fitted model'")
             assert drawn_share(view(tab)) > 0.1
             assert (tab.page.get_by_test_id("fit-without-scan").count() == 1) is alone
             assert (tab.page.locator("[data-testid=fit-colour] [data-value=model]").count() == 0) is alone
             assert tab.page.locator("[data-testid=fit-colour] [data-value=regions]").count() == 0
         tab.shot("alone")
         assert tab.complaints == []
-
-
-def test_a_dropped_scan_is_fitted_as_the_command_line_fits_it(
-    open_tab, address: str, world: World, tmp_path: Path
-) -> None:
-    tab = ready(open_tab(address))
-    drop(tab, world.scan)
-    assert verdict(tab) == "converged"
-    tab.page.get_by_test_id("scan-remove").wait_for()
-    assert drawn_share(view(tab)) > 0.1
-    tab.shot("verdict")
-    assert "mean where the scan shows it" in tab.page.get_by_test_id("verdict").inner_text()
-    with tab.page.expect_download() as waiting:
-        tab.page.get_by_test_id("scan-record").click()
-    waiting.value.save_as(tmp_path / "dropped.fit.json")
-    assert main(["fit", str(world.model), str(world.scan), "-o", str(tmp_path / "cli"), "--quiet"]) == 0
-    here, there = json.loads((tmp_path / "dropped.fit.json").read_text()), read_record(tmp_path / "cli/plain.fit.json")
-    assert here["b"] == list(there.b)
-    assert here["status"] == there.status
-    tab.page.get_by_test_id("scan-remove").click()
-    tab.page.get_by_test_id("verdict").wait_for(state="hidden")
-    assert tab.complaints == []
-
-
-@pytest.mark.long
-def test_of_several_files_a_broken_one_gives_one_sentence_and_the_others_go_on(
-    open_tab, address: str, world: World
-) -> None:
-    tab = ready(open_tab(address), "scan")
-    tab.page.get_by_test_id("dense").check()
-    drop(tab, world.broken, world.scan)
-    assert verdict(tab) == "failed"
-    said = tab.page.get_by_test_id("scan-status").inner_text()
-    assert "broken.ply" in said
-    assert "Traceback" not in said
-    tab.shot("sentence")
-    rows = tab.page.get_by_test_id("own-scan")
-    assert [row.get_attribute("data-name") for row in rows.all()] == ["broken.ply", "plain.ply"]
-    tab.page.locator('[data-testid="own-scan"].converged').wait_for()
-    rows.nth(1).click()
-    tab.until("document.querySelector('[data-testid=scan-status]')?.dataset.status === 'converged'")
-    tab.page.get_by_test_id("scan-detail").locator("[data-value=dense]").click()
-    assert "dense surface" in tab.page.get_by_test_id("scan-exported").inner_text()
-    tab.page.get_by_test_id("scan-remove").click()
-    tab.until("!document.querySelector('[data-testid=own-scan]')")
-    assert tab.page.get_by_test_id("scan-status").get_attribute("data-status") == "failed"
-    tab.page.get_by_test_id("scan-remove").click()
-    tab.page.get_by_test_id("verdict").wait_for(state="hidden")
 
 
 def test_the_difference_is_told_by_what_it_moves(open_tab, address: str) -> None:
@@ -308,15 +239,6 @@ def test_the_difference_is_told_by_what_it_moves(open_tab, address: str) -> None
     tab.page.get_by_test_id("tab-compare").click()
     told = tab.page.get_by_test_id("compare-facts").inner_text()
     assert "mode 1: it moves" in told and "at +1.00 standard deviations" in told
-
-
-def test_what_is_no_scan_is_refused_in_a_sentence(open_tab, address: str, tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").write_text("not a scan")
-    tab = ready(open_tab(address))
-    drop(tab, tmp_path / "notes.txt")
-    message = tab.page.get_by_test_id("message")
-    message.wait_for(state="visible")
-    assert "notes.txt" in message.inner_text()
 
 
 def add_csv(tab, path: Path, text: str) -> None:
@@ -359,7 +281,7 @@ def test_coefficients_of_another_model_are_refused(open_tab, address: str, world
     waiting.value.save_as(tmp_path / "shape.csv")
     tab.page.get_by_test_id("tab-compare").click()
     tab.page.get_by_test_id("csv-file").set_input_files(tmp_path / "shape.csv")
-    tab.until("document.querySelector('#compare-b').innerText.includes('(shape.csv)')")
+    tab.until(f"{PANE}.shadowRoot.getElementById('compare-b').innerText.includes('(shape.csv)')")
     assert message.is_hidden()
     assert tab.complaints == []
 
@@ -376,14 +298,14 @@ def test_a_message_covers_nothing_and_goes(open_tab, address: str, tmp_path: Pat
     message = tab.page.get_by_test_id("message")
 
     def fail() -> None:
-        (tmp_path / "notes.txt").write_text("not a scan")
-        drop(tab, tmp_path / "notes.txt")
+        tab.page.get_by_test_id("tab-compare").click()
+        add_csv(tab, tmp_path / "notes.csv", "not a table")
         message.wait_for(state="visible")
 
     fail()
     tab.shot(f"{viewport['width']}")
     x0, y0, x1, y1 = box(message)
-    for name in ("view", "view-home", "export-png", "tab-model", "choose"):
+    for name in ("view", "view-home", "export-png", "tab-model", "csv-button"):
         a0, b0, a1, b1 = box(tab.page.get_by_test_id(name))
         assert min(x1, a1) - max(x0, a0) < 1 or min(y1, b1) - max(y0, b0) < 1, name
     tab.page.get_by_test_id("message-close").click()
@@ -408,7 +330,7 @@ def test_on_a_phone_no_key_covers_the_picture(open_tab, address: str) -> None:
     tab.page.locator('[data-testid="fit"][data-name="holes"]').click()
     for colour, key in (("plain", "legend"), ("regions", "legend"), ("model", "colour-bar")):
         tab.page.get_by_test_id("fit-detail").locator(f"[data-testid=fit-colour] [data-value={colour}]").click()
-        tab.page.evaluate("scrollTo(0, 0)")
+        tab.page.evaluate(f"{PANE}.shadowRoot.querySelector('.shown').scrollTop = 0")
         below = box(tab.page.get_by_test_id(key))
         assert below[1] >= box(tab.page.get_by_test_id("view"))[3] - 1
         assert below[3] <= box(tab.page.get_by_test_id("tab-fits"))[1] + 1
@@ -452,48 +374,48 @@ def test_the_names_of_files_keep_their_letters(open_tab, address: str) -> None:
 
 
 @pytest.mark.long
-def test_a_reload_keeps_the_scans(open_tab, address: str, world: World) -> None:
-    tab = ready(open_tab(address))
-    drop(tab, world.scan)
-    assert verdict(tab) == "converged"
-    tab.page.reload()
-    ready(tab)
-    tab.page.get_by_test_id("tab-scan").click()
-    assert verdict(tab) == "converged"
-    tab.page.get_by_test_id("scan-remove").click()
-    tab.page.get_by_test_id("verdict").wait_for(state="hidden")
-    assert tab.complaints == []
-
-
-@pytest.fixture(scope="module")
-def people(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """A viewer of a model of 200 ICT people."""
+def test_a_fit_of_james_is_shown_beside_his_scan(open_tab, shared_data: Path, tmp_path: Path) -> None:
+    """By a model of 200 ICT people."""
     from shapespace.datasets.ict import landmark_vertices, load_ict
     from shapespace.model.shape_model import ShapeModel
 
     ict = load_ict(shared_data / "ict-facekit")
     meshes = [ict.mesh(c, name=f"{i}") for i, c in enumerate(ict.draw_people(200, seed=1))]
-    path = tmp_path_factory.mktemp("ict") / "people.h5"
+    path = tmp_path / "people.h5"
     ShapeModel.fit(meshes, modes=None, landmarks=landmark_vertices("face")).save(path)
-    with viewer(path) as found:
-        yield found
+    scan = shared_data / "james" / "james.obj"
+    assert main(["fit", str(path), str(scan), "-o", str(tmp_path / "fits"), "--stages", "--quiet"]) == 0
+    with viewer(tmp_path / "fits") as address:
+        tab = ready(open_tab(address, {"width": 1200, "height": 720}), "fits")
+        panel = tab.page.get_by_test_id("fit-detail")
+        panel.locator("[data-value=side]").click()
+        panel.locator("[data-value=model]").click()
+        tab.page.wait_for_timeout(1500)
+        assert drawn_share(view(tab)) > 0.1
+        same_as_kept("viewer.png", tab.shot("readme"))
+        assert tab.complaints == []
 
 
-@pytest.mark.long
-def test_james_is_dropped_and_judged(open_tab, people: str, shared_data: Path) -> None:
-    tab = ready(open_tab(people, {"width": 1200, "height": 720}))
-    drop(tab, shared_data / "james" / "james.obj")
-    assert verdict(tab) in ("converged", "doubtful")
-    tab.page.wait_for_timeout(1500)
-    assert drawn_share(view(tab)) > 0.1
-    tab.shot("overlaid")
-    panel = tab.page.get_by_test_id("scan-detail")
-    panel.locator("[data-value=side]").click()
-    panel.locator("[data-value=model]").click()
-    tab.page.get_by_test_id("panel-scan").evaluate("e => { e.scrollTop = 0; e.parentElement.scrollTop = 0; }")
-    tab.page.wait_for_timeout(1500)
-    same_as_kept("viewer.png", tab.shot("readme"))
-    assert tab.complaints == []
+def test_a_link_shows_the_same_and_back_goes_back(open_tab, address: str) -> None:
+    tab = ready(open_tab(address))
+    slide(tab, 2, -1.5)
+    tab.page.evaluate("window.shapespaceStage.a.camera = { yaw: 0.7, pitch: 0.2, zoom: 0.8 }")
+    tab.until("location.hash.includes('camera=0.7')")
+    link = tab.page.url
+    assert "z=2:-1.5" in link and "tab=model" in link
+    shown = view(tab)
+    other = open_tab(address)
+    other.page.goto(link)
+    other.page.reload()
+    other.until(f"{PANE}?.dataset.ready === 'true'")
+    assert other.page.get_by_test_id("value-2").inner_text() == "\u22121.50"
+    assert change(shown, view(other)) < 0.002
+    fits = link.partition("#")[0] + "#?tab=fits&fit=holes"
+    other.page.goto(fits)
+    other.until(f"{PANE}.shadowRoot?.getElementById('caption-a')?.textContent.startsWith('holes')")
+    other.page.go_back()
+    other.until(f"{PANE}.shadowRoot?.querySelector('[data-testid=value-2]')?.innerText === '\u22121.50'")
+    assert tab.complaints == [] and other.complaints == []
 
 
 def test_the_token_does_not_stay_in_the_address_and_a_link_from_elsewhere_leads_in(
@@ -502,7 +424,8 @@ def test_the_token_does_not_stay_in_the_address_and_a_link_from_elsewhere_leads_
     page_at, _, token = address.partition("?")
     assert token.startswith("token=")
     tab = ready(open_tab(address))
-    assert tab.page.url == page_at and "token" not in tab.page.evaluate("performance.getEntries()[0].name")
+    assert tab.page.url.partition("#")[0] == page_at
+    assert "token" not in tab.page.evaluate("performance.getEntries()[0].name")
     tab.page.reload()
     ready(tab)
     assert tab.page.evaluate("history.length") <= 2  # the empty page it was opened with, and this one
@@ -511,5 +434,5 @@ def test_the_token_does_not_stay_in_the_address_and_a_link_from_elsewhere_leads_
     other = open_tab(mail.as_uri())
     other.page.get_by_role("link").click()
     ready(other)
-    assert other.page.url == page_at
+    assert other.page.url.partition("#")[0] == page_at
     assert tab.complaints == [] and other.complaints == []

@@ -611,22 +611,21 @@ COMMANDS: tuple[CommandSpec, ...] = (
         ("Runs no fit. The report is one file that needs no network. Needs the extra report.",),
     ),
     CommandSpec(
-        "view", "view a shape model, fits, surfaces in correspondence or a project in the browser",
+        "view", "view a model, fits, surfaces in correspondence, an analysis or a project in the browser",
         ("shapespace view model.h5",),
         "cli.pages:view",
         (
-            basic("path", "MODEL.h5|DIR", "a model, a folder that fit or correspond wrote, or a project of the studio",
+            basic("path", "MODEL.h5|DIR", "a model, a folder of results, a report, or a project of the studio",
                   parse=Path),
             basic("--model", "MODEL.h5", source=VIEW),
             basic("--no-open", help="do not open a browser"),
             basic("--port", "N", source=VIEW),
             advanced("--host", "H", source=VIEW),
-            advanced("--max-upload-mb", "N", source=VIEW, parse=values.positive),
         ),
         (
-            "A scan that is dropped onto the page of a model is fitted. A project is shown as in the studio, which "
-            "may run at the same time; nothing is written into it. The address that is printed contains a token, "
-            "without which nothing is answered. Ctrl-C ends the viewer. Needs the extra view.",
+            "The page is that of the studio, without edits; nothing is written. A project can be shown while the studio "
+            "has it open. The address that is printed contains a token, without which nothing is answered. Ctrl-C ends "
+            "the viewer. Needs the extra view.",
         ),
         defaults=_FOR_FORMS,
         json=False,

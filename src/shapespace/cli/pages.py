@@ -11,12 +11,15 @@ from shapespace.viewer.serve import serve, serve_studio
 
 
 def view(arguments: argparse.Namespace) -> int:
-    """Show a model, fits, or surfaces in correspondence in the browser."""
+    """Show a result or a project in the browser."""
     options = given(arguments, serve)
     serve(
-        arguments.path, **options, open_browser=not arguments.no_open, quiet=arguments.quiet,
-        forms=lambda: forms(arguments.commands()), say=now,
-    )  # fmt: skip
+        arguments.path,
+        **options,
+        open_browser=not arguments.no_open,
+        forms=lambda: forms(arguments.commands()),
+        say=now,
+    )
     return 0
 
 

@@ -26,11 +26,9 @@ from shapespace.report.inputs.correspondence_folder import (
     scan_status,
 )
 from shapespace.report.inputs.saved_fits import ScanNotFoundError
-from shapespace.report.render import palette as colours
 from shapespace.report.render.scene import bounded_scan, decimate, pack, quantise
 from shapespace.report.render.thumbnails import SQUARES, checker_places, mean_at_vertices
 from shapespace.types import FloatArray
-from shapespace.version import __version__
 
 MAX_MARKED = 100
 """Vertices whose positions can be asked for at a time."""
@@ -64,11 +62,10 @@ class Surfaces:
         self.packed_faults = lru_cache(maxsize=2 * _PAGE)(self._pack_faults)
 
     def about(self) -> dict[str, Any]:
-        """Return the counts and colours that the page needs first, without reading surfaces."""
+        """Return the counts that the page needs first, without reading surfaces."""
         run = self._corresponded.run
         page = _PAGE_BYTES // (_BYTES_PER_VERTEX * max(len(self._corresponded.mean.vertices), 1))
         return {
-            "version": __version__,
             "name": self._corresponded.root.resolve().name,
             "scans": len(self._corresponded.records) + len(self._corresponded.unread),
             "corresponding": len(self._corresponded.corresponding),
@@ -77,12 +74,7 @@ class Surfaces:
             "page": max(1, min(_PAGE, page)),
             "is_large": len(self._corresponded.corresponding) * len(self._corresponded.mean.vertices) > _LARGE,
             "most_marked": MAX_MARKED,
-            "clay": colours.CLAY,
-            "unknown_colour": colours.UNKNOWN_COLOUR,
-            "diverging": colours.as_list(colours.DIVERGING),
-            "sequential": colours.as_list(colours.SEQUENTIAL),
             "squares": SQUARES.round(3).tolist(),
-            "marks": [list(colour) for colour in colours.CATEGORIES],
         }
 
     def packed_mean(self) -> bytes:

@@ -39,16 +39,6 @@ FRAMED_HEADERS: Mapping[str, str] = MappingProxyType(
     }
 )
 """The same headers for a page that notebooks on this machine may show in a frame."""
-OWN_FRAMES_HEADERS: Mapping[str, str] = MappingProxyType(
-    {
-        **SECURITY_HEADERS,
-        "X-Frame-Options": "SAMEORIGIN",
-        "Content-Security-Policy": SECURITY_HEADERS["Content-Security-Policy"].replace(
-            "frame-ancestors 'none'", "frame-src 'self'; frame-ancestors 'self'"
-        ),
-    }
-)
-"""The same headers for an application whose pages show others of it in frames."""
 _SECRET_BYTES = 32  # bytes, 256 bits: cannot be guessed
 _IGNORED_HEADERS = (b"range", b"if-range")
 """Partial responses are not supported."""
@@ -95,19 +85,15 @@ class Guard:
         cookie_name: browsers share cookies between ports, so the name should contain the port.
         loopback: whether only this machine can reach the server; requests for other host names are then rejected.
         framed: whether notebooks on this machine may show the page in a frame.
-        frames: whether pages of the application may show other pages of the application in frames.
     """
 
-    def __init__(
-        self, app: ASGIApp, *, access: Access, cookie_name: str, loopback: bool, framed: bool = False,
-        frames: bool = False,
-    ) -> None:  # fmt: skip
+    def __init__(self, app: ASGIApp, *, access: Access, cookie_name: str, loopback: bool, framed: bool = False) -> None:
         self._app = app
         self._access = access
         self._cookie_name = cookie_name
         self._loopback = loopback
         self._framed = framed
-        self._headers = FRAMED_HEADERS if framed else OWN_FRAMES_HEADERS if frames else SECURITY_HEADERS
+        self._headers = FRAMED_HEADERS if framed else SECURITY_HEADERS
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handle one request."""

@@ -29,15 +29,16 @@ from shapespace.report.inputs.saved_fits import (
     saved_surfaces,
     staged_fit,
 )
-from shapespace.report.render.scene import pack_model, pack_surfaces
+from shapespace.report.render.scene import pack_fit, pack_model, pack_surfaces
 from shapespace.schemas import FIT_AGAIN, FitRecord, to_json
 from shapespace.store.manifest import Manifest
 from shapespace.store.results import results_at
 from shapespace.types import Mesh
-from shapespace.viewer.fitting import pack_staged
 
 MAX_MODEL_BYTES = 48 * 2**20
 """Modes beyond this size are not sent, and the page shows a note; in the browser they take twice as much memory."""
+MAX_TRIANGLES = 300_000
+"""Triangles of a scan that are sent to the page."""
 _BYTES_PER_VERTEX = 6  # bytes of a mode; three coordinates of 16 bits
 MAX_LISTED = 1000
 """Fits of a store that the page lists: those with the most concerns."""
@@ -179,7 +180,7 @@ class ModelView:
             raise InputError(f"{name} was fitted by another model; give that one with --model.")
         with _as_damaged(name):
             try:
-                return pack_staged(staged_fit(self.folder, fit))
+                return pack_fit(staged_fit(self.folder, fit), most_sent=MAX_TRIANGLES)
             except ScanNotFoundError as error:
                 surfaces = saved_surfaces(self.folder, fit)
                 return pack_surfaces(

@@ -88,23 +88,22 @@ def view_fit(result: FitResult, *, height_px: int) -> NotebookView:
 
 def _start(model: ShapeModel, result: FitResult | None, height_px: int) -> NotebookView:
     require_view_extra()
-    from shapespace.viewer.guard import Access
+    from shapespace.viewer.guard import Access, Guard
     from shapespace.viewer.model_view import ModelView
-    from shapespace.viewer.server import make_app
-    from shapespace.viewer.uploaded_scans import FOLDER_PREFIX, Scans
+    from shapespace.viewer.server import model_app
+    from shapespace.viewer.studio.views import single_result_app
 
     access, name = Access(), model.file.name if model.file else "model"
     with ExitStack() as stack:
-        root = Path(stack.enter_context(TemporaryDirectory(prefix=FOLDER_PREFIX, ignore_cleanup_errors=True)))
         folder = None
         if result is not None:
-            folder = root / "fits"
+            root = stack.enter_context(TemporaryDirectory(prefix="shapespace-view-", ignore_cleanup_errors=True))
+            folder = Path(root) / "fits"
             save_fit(result, folder, "", stages=True)
         listener = stack.enter_context(listen(_HOST, None))
         port = int(listener.getsockname()[1])
-        scans = Scans(root, model, name)
-        stack.callback(scans.close)
-        app = make_app(ModelView(model, name, folder), scans, access, cookie_name=f"shapespace_{port}", framed=True)
+        page = single_result_app(name, {"model": model_app(ModelView(model, name, folder))})
+        app = Guard(page, access=access, cookie_name=f"shapespace_{port}", loopback=True, framed=True)
         server = make_server(app)
         thread = threading.Thread(
             target=server.run, kwargs={"sockets": [listener]}, name="shapespace viewer", daemon=True

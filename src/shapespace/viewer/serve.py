@@ -14,13 +14,11 @@ from collections.abc import Callable, Generator, Mapping
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from shapespace.batch.workers import context, interrupts_ignored, preload, start_loading
+from shapespace.batch.workers import context, interrupts_ignored, preload
 from shapespace.errors import InputError, ShapespaceError
-from shapespace.schemas import CorrespondenceRecord
 
 if TYPE_CHECKING:
     import uvicorn
@@ -51,58 +49,41 @@ def serve(
     host: str = "127.0.0.1",
     port: int | None = None,
     open_browser: bool = True,
-    max_upload_mb: int = 200,
-    quiet: bool = False,
     forms: Callable[[], Mapping[str, Mapping[str, Any]]] = dict,
     say: Callable[[str], None] = print,
 ) -> None:
-    """Show a model, the fits of a folder, surfaces in correspondence, or a project in the browser until Ctrl-C.
+    """Show a model, fits, surfaces in correspondence, a report, or a project in the browser until Ctrl-C.
 
     Args:
-        path: a model file, a folder that `shapespace fit` or `shapespace correspond` wrote, or a project of the studio.
+        path: a model file, a folder of results, a report, or a project of the studio.
         model: model file of the fits in the folder (default: the one that their records name).
         host: address to listen at.
         port: port (default: the first free one from 7860).
         open_browser: whether to open the page.
-        max_upload_mb: size limit of a scan that is dropped onto the page, in MB.
-        quiet: whether to hide the message about code that is being compiled.
         forms: function that returns the forms of the commands, with whose labels a project is shown.
         say: called with the address, which contains the token.
 
     Raises:
         ShapespaceError: the extra `view` is not installed.
         FileError: the model or the folder cannot be read.
-        InputError: the port is taken, the host is not an address of this machine, or a model is given with surfaces.
+        InputError: the port is taken, the host is not an address of this machine, or a model is given without fits.
     """
     require_view_extra()
-    has_surfaces, is_project = (path / CorrespondenceRecord.FILE).is_file(), _is_project(path)
-    if (has_surfaces or is_project) and model is not None:
-        what = "a correspondence" if has_surfaces else "a project"
-        raise InputError(f"{path} is {what} without fits; omit --model.")
-    if is_project:
-        serve_studio(
-            path, forms(), host=host, port=port, open_browser=open_browser, max_upload_mb=max_upload_mb, read_only=True,
-            say=say,
-        )  # fmt: skip
+    if _is_project(path):
+        if model is not None:
+            raise InputError(f"{path} is a project without fits; omit --model.")
+        serve_studio(path, forms(), host=host, port=port, open_browser=open_browser, read_only=True, say=say)
         return
-    if not has_surfaces:
-        # While this process imports its own code.
-        start_loading(notify=not quiet)
-    from shapespace.viewer.corresponding_surfaces import Surfaces
-    from shapespace.viewer.model_view import ModelView
-    from shapespace.viewer.server import make_app, make_surfaces_app
-    from shapespace.viewer.uploaded_scans import FOLDER_PREFIX, Scans, UploadLimits
+    from shapespace.viewer.guard import Guard
+    from shapespace.viewer.studio.views import open_view, single_result_app, view_kinds
 
-    with _end_by_signals(), ExitStack() as stack:
-        if has_surfaces:
-            make = partial(make_surfaces_app, Surfaces(path))
-        else:
-            view = ModelView.open(path, model)
-            root = Path(stack.enter_context(TemporaryDirectory(prefix=FOLDER_PREFIX, ignore_cleanup_errors=True)))
-            scans = Scans(root, view.model, view.model_name, UploadLimits(upload_bytes=max_upload_mb * 2**20))
-            stack.callback(scans.close)
-            make = partial(make_app, view, scans)
-        _run(make, "viewer", host, port, open_browser=open_browser, say=say)
+    with _end_by_signals():
+        kinds = view_kinds(path) or ["model"]  # its reader knows models of other tools, and rejects the rest
+        if model is not None and "model" not in kinds:
+            what = "a correspondence" if "surfaces" in kinds else "a report"
+            raise InputError(f"{path} is {what} without fits; omit --model.")
+        page = single_result_app(path.resolve().name, {kind: open_view(kind, path, model=model) for kind in kinds})
+        _run(partial(Guard, page), "viewer", host, port, open_browser=open_browser, say=say)
 
 
 def serve_studio(
@@ -175,7 +156,7 @@ def _run(
     access, loopback = Access(), host in LOOPBACK
     with contextlib.closing(listen(host, port)) as listener:
         port = int(listener.getsockname()[1])
-        server = make_server(make(access, loopback=loopback, cookie_name=f"shapespace_{port}"))
+        server = make_server(make(access=access, loopback=loopback, cookie_name=f"shapespace_{port}"))
         if started is not None:
             started(server)
         say(f"The {what} is at {page_address(host, port, access.token)}")

@@ -1,5 +1,5 @@
-// What the report does beyond being read: another theme, tables that sort, pictures that turn.
-(function () {
+// The theme of a report that is a page of its own.
+function startReportTheme() {
   "use strict";
   const root = document.documentElement;
   const system = window.matchMedia("(prefers-color-scheme: dark)");
@@ -32,24 +32,16 @@
   system.addEventListener("change", tellTheme);
   nameButton();
   button.hidden = false;
+}
 
-  // In the studio: its theme, and of an answer first what turns; the sentences are above the report already.
-  if (root.classList.contains("in-studio")) {
-    window.addEventListener("message", (event) => {
-      if (event.source !== window.parent || !["light", "dark"].includes(event.data && event.data.theme)) return;
-      root.dataset.theme = event.data.theme;
-      tellTheme();
-    });
-  }
-  if (root.classList.contains("answer")) {
-    const list = document.querySelector("nav ul"), main = document.getElementById("content");
-    const isMap = (item) => document.getElementById(item.firstElementChild.hash.slice(1)).parentElement.querySelector(".turning") !== null;
-    const items = Array.from(list.children), maps = items.filter(isMap);
-    for (const item of maps.concat(items.filter((other) => !maps.includes(other)))) {
-      list.append(item);
-      main.append(document.getElementById(item.firstElementChild.hash.slice(1)).parentElement);
-    }
-  }
+/**
+ * What a report does beyond being read: tables that sort, pictures that turn, links within it.
+ * root: the document, or the root of a report within another page; scroller: what scrolls it, the window or an element;
+ * signal: of an AbortController that ends it.
+ */
+window.startShapespaceReport = function (root, scroller, signal) {
+  "use strict";
+  const byAddress = (hash) => root.getElementById(decodeURIComponent(hash.slice(1)));
 
   // Tables: numbers by their value, texts as people order them; rows without a number stay last.
   const collator = new Intl.Collator(undefined, { numeric: true, sensitivity: "base" });
@@ -71,7 +63,7 @@
     rows.sort((a, b) => compare(a.key, b.key, sign));
     body.append(...rows.map((entry) => entry.row));
   }
-  for (const table of document.querySelectorAll("table.sortable")) {
+  for (const table of root.querySelectorAll("table.sortable")) {
     const heads = Array.from(table.tHead.rows[0].cells);
     heads.forEach((head, column) => {
       const sorter = document.createElement("button");
@@ -114,41 +106,46 @@
   }
   const narrowPage = window.matchMedia("(max-width: 640px)");
   function offerAll() {
-    if (narrowPage.matches) document.querySelectorAll("figure.drawing, figure.plain, figure.chart").forEach(offer);
+    if (narrowPage.matches) root.querySelectorAll("figure.drawing, figure.plain, figure.chart").forEach(offer);
   }
-  window.addEventListener("load", offerAll);
-  narrowPage.addEventListener("change", offerAll);
+  narrowPage.addEventListener("change", offerAll, { signal });
 
   // Tables wider than the page have a note.
   function tellWide() {
-    for (const holder of document.querySelectorAll(".table")) {
+    for (const holder of root.querySelectorAll(".table")) {
       holder.classList.toggle("wide", holder.scrollWidth > holder.clientWidth + 4);
     }
   }
-  window.addEventListener("load", tellWide);
-  window.addEventListener("resize", tellWide);
-  document.addEventListener("toggle", tellWide, true);
+  // Sizes of pictures and tables are known once all has loaded.
+  const measure = () => { offerAll(); tellWide(); };
+  if (document.readyState === "complete") measure();
+  else window.addEventListener("load", measure, { signal });
+  window.addEventListener("resize", tellWide, { signal });
+  root.addEventListener("toggle", tellWide, true);
 
   // What an address or a link leads to is opened where it is folded away.
-  function unfold() {
-    const target = document.getElementById(decodeURIComponent(window.location.hash.slice(1)));
+  function unfold(hash) {
+    const target = byAddress(hash);
     for (let part = target; part; part = part.parentElement) if (part.tagName === "DETAILS") part.open = true;
-    if (target && target.closest("details")) target.scrollIntoView();
+    if (target && (root !== document || target.closest("details"))) target.scrollIntoView();
   }
-  window.addEventListener("hashchange", unfold);
-  document.addEventListener("click", (event) => {
+  window.addEventListener("hashchange", () => { if (root === document) unfold(window.location.hash); }, { signal });
+  root.addEventListener("click", (event) => {
     const link = event.target.closest && event.target.closest("a[href^='#']");
-    if (link && link.getAttribute("href") === window.location.hash) unfold();
+    if (!link) return;
+    if (root !== document) event.preventDefault(); // the address is that of the page around the report
+    if (root !== document || link.getAttribute("href") === window.location.hash) unfold(link.hash);
   });
-  unfold();
+  if (root === document) unfold(window.location.hash);
 
   // The navigation marks the part that is read.
-  const links = Array.from(document.querySelectorAll("nav a"));
+  const links = Array.from(root.querySelectorAll("nav a"));
   function tellWhere() {
     const height = links.length ? links[0].closest("nav").offsetHeight : 0;
-    document.documentElement.style.scrollPaddingTop = `${height + 14}px`;
-    const below = links.findIndex((link) => document.getElementById(link.hash.slice(1)).getBoundingClientRect().top > height + 74);
-    const end = window.innerHeight + window.scrollY >= document.documentElement.scrollHeight - 4;
+    const box = scroller === window ? document.documentElement : scroller, top = scroller === window ? 0 : box.getBoundingClientRect().top;
+    box.style.scrollPaddingTop = `${height + 14}px`;
+    const below = links.findIndex((link) => byAddress(link.hash).getBoundingClientRect().top > top + height + 74);
+    const end = box.scrollTop + box.clientHeight >= box.scrollHeight - 4;
     const at = end || below < 0 ? links.length - 1 : Math.max(0, below - 1);
     links.forEach((link, k) => {
       if ((k === at) === link.hasAttribute("aria-current")) return;
@@ -159,21 +156,21 @@
       list.scrollTop += link.getBoundingClientRect().top - list.getBoundingClientRect().top - 46; // of two rows
     });
   }
-  window.addEventListener("scroll", tellWhere, { passive: true });
+  scroller.addEventListener("scroll", tellWhere, { passive: true, signal });
   tellWhere();
 
   // Paper has no folds.
   let folded = [];
   window.addEventListener("beforeprint", () => {
-    folded = Array.from(document.querySelectorAll("details:not([open])"));
+    folded = Array.from(root.querySelectorAll("details:not([open])"));
     folded.forEach((part) => { part.open = true; });
-  });
-  window.addEventListener("afterprint", () => folded.forEach((part) => { part.open = false; }));
+  }, { signal });
+  window.addEventListener("afterprint", () => folded.forEach((part) => { part.open = false; }), { signal });
 
   // What turns builds itself when it comes near the window; the still stays where that fails, and for paper.
-  for (const widget of document.querySelectorAll(".widget")) {
+  for (const widget of root.querySelectorAll(".widget")) {
     const parent = widget.parentElement;
-    window.Shapespace.widgets[widget.dataset.widget](widget, widget.dataset.payload).then((made) => {
+    window.Shapespace.widgets[widget.dataset.widget](widget, root.getElementById(widget.dataset.payload)).then((made) => {
       if (made && made.view.works) return parent.classList.add("running");
       const note = document.createElement("p");
       note.className = "soft";
@@ -182,4 +179,10 @@
       parent.classList.add("refused");
     });
   }
-})();
+};
+
+// Within the report's own file.
+if (!document.currentScript.src) {
+  startReportTheme();
+  window.startShapespaceReport(document, window);
+}

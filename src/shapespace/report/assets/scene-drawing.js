@@ -172,7 +172,7 @@
 
   /** Return the CSS colour behind an element. */
   function backgroundOf(element) {
-    for (let e = element; e; e = e.parentElement) {
+    for (let e = element; e; e = e.parentElement || e.getRootNode().host) {
       const colour = getComputedStyle(e).backgroundColor;
       if (colour && colour !== "transparent" && colour !== "rgba(0, 0, 0, 0)") return colour;
     }

@@ -149,8 +149,8 @@
         chosen.textContent = marked.length ? `${marked.length} selected: ${marked.slice(0, 6).join(", ")}${marked.length > 6 ? " \u2026" : ""}` : "";
         for (const one of [copy, clear]) one.hidden = !marked.length;
         request({ plot: true });
-        // The studio offers to exclude or to group them; names are no secret to a page that shows the report.
-        if (window.parent !== window) window.parent.postMessage({ selected: marked }, "*");
+        // The studio offers to exclude or to group them.
+        element.dispatchEvent(new CustomEvent("shapespace:selected", { bubbles: true, composed: true, detail: marked }));
       }
       const selector = button("Select", () => {
         selects = !selects;
@@ -158,7 +158,7 @@
       }, { "aria-pressed": "false", title: "Draw a line around shapes to select them; with Shift, add to the selection" });
       const copy = button("Copy names", () => {
         const marked = Array.from(selected, (v) => names[v]);
-        // Without access to the clipboard, as in a frame, the names are shown to be copied by hand.
+        // Without access to the clipboard the names are shown to be copied by hand.
         navigator.clipboard.writeText(marked.join("\n")).catch(() => { chosen.textContent = marked.join(", "); });
       }, { hidden: true });
       const clear = button("Clear selection", () => { selected.clear(); changeSelection(); }, { hidden: true });

@@ -1,4 +1,4 @@
-/* The controls of one fit, saved or just made: stages, layout, colours, opacities, threshold, iterations and exports. */
+/* The controls of one fit: stages, layout, colours, opacities, threshold, iterations and exports. */
 (function () {
   "use strict";
 
@@ -30,9 +30,9 @@
   /** The controls of `fit`, a FitView, in its element: made for a payload, and updated with each picture. */
   Viewer.FitControls = class {
     constructor(fit) {
-      const { prefix, view } = fit, { arrays, facts } = fit.payload;
+      const { view } = fit, { arrays, facts } = fit.payload;
       this.fit = fit;
-      const id = (name) => `${prefix}-${name}`;
+      const id = (name) => `fit-${name}`;
       this.stageButtons = segments(facts.stages.map((s) => [s, s === "final" && !facts.stages.includes("initial") ? "Fitted" : STAGES[s] || s]), "Stage", id("stage"), (stage) => {
         fit.stop();
         Object.assign(fit.view, { stage, moment: null });
@@ -79,7 +79,7 @@
           type: "button", "data-testid": id(`export-${kind}`), onclick: () => this._surface(kind),
         }, `Surface ${kind.toUpperCase()}`)),
         h("button", { type: "button", "data-testid": id("export-csv"), onclick: () => this._csv() }, "Coefficients CSV"),
-        h("button", { type: "button", "data-testid": id("use"), onclick: () => fit.context.apply(this._z(), facts.label || facts.name) }, "Use in Model"));
+        h("button", { type: "button", "data-testid": id("use"), onclick: () => fit.context.apply(this._z()) }, "Use in Model"));
       fit.element.replaceChildren(
         ...[facts.without_scan ? h("p", { "data-testid": id("without-scan") }, facts.without_scan) : null,
           ...(facts.stages.length > 1 ? [h("h2", {}, "Stage"), this.stageButtons] : []), h("h2", {}, "Show"), arrays.scan ? this.layoutButtons : null, this.colourButtons,
@@ -95,12 +95,12 @@
     }
 
     _z() {
-      return this.fit.source.z || Array.from(this.fit.payload.arrays.z);
+      return Array.from(this.fit.payload.arrays.z);
     }
 
     _csv() {
       const { fit } = this, { facts, arrays } = fit.payload;
-      const b = fit.source.b || Array.from(arrays.b), sd = fit.source.b_stddev || Array.from(arrays.b_stddev);
+      const b = Array.from(arrays.b), sd = Array.from(arrays.b_stddev);
       const name = facts.name.replace(/\.[^.]*$/, "");
       Viewer.save(Viewer.coefficientsCsv([{ name, status: facts.status, b, z: this._z(), sd }], fit.context.about.modes), `${name}.coefficients.csv`);
     }

@@ -1,4 +1,4 @@
-/* One fit, saved or just made, as it is drawn: stages, overlay or side by side, distance maps, regions, iterations. */
+/* One fit as it is drawn: stages, overlay or side by side, distance maps, regions, iterations. */
 (function () {
   "use strict";
 
@@ -14,13 +14,12 @@
 
   /**
    * One fit, with its controls in `element` and its pictures in `context.stage`.
-   * context: {stage, model, about, apply(z, name), download(question, kind, name), alert(sentence)}.
+   * context: {stage, model, about, apply(z), download(question, kind, name)}.
    */
   Viewer.FitView = class {
-    constructor(element, context, prefix) {
+    constructor(element, context) {
       this.element = element;
       this.context = context;
-      this.prefix = prefix;
       this.payload = null;
       this.active = false;
       this.controls = null;
@@ -125,7 +124,7 @@
     draw(frame) {
       if (!this.payload || !this.active) return;
       const { view, payload } = this, { arrays, facts } = payload;
-      const { stage, about } = this.context;
+      const { stage } = this.context;
       const side = view.layout === "side";
       stage.split(side);
       const model = side ? stage.b : stage.a;
@@ -135,15 +134,15 @@
       if (stage.holds !== this) {
         stage.clear();
         stage.holds = this;
-        if (this.scan) stage.a.setSurface("scan", { ...this.scan, colour: about.scan_colour });
+        if (this.scan) stage.a.setSurface("scan", { ...this.scan, colour: Shapespace.colours.scan });
         this._drawn = payload;
       } else if (this._drawn !== payload) {
-        if (this.scan) stage.a.setSurface("scan", { ...this.scan, colour: about.scan_colour });
+        if (this.scan) stage.a.setSurface("scan", { ...this.scan, colour: Shapespace.colours.scan });
         else stage.a.remove("scan");
         model.remove("model");
         this._drawn = payload;
       }
-      if (!model.has("model")) model.setSurface("model", { positions, faces: arrays.faces || null, colour: about.model_colour });
+      if (!model.has("model")) model.setSurface("model", { positions, faces: arrays.faces || null, colour: Shapespace.colours.model });
       else model.move("model", positions);
       if (this.scan) stage.a.set("scan", { opacity: view.scanOpacity, visible: view.scanOpacity > 0.01 });
       model.set("model", { opacity: view.modelOpacity, visible: view.modelOpacity > 0.01 });
@@ -159,21 +158,21 @@
     }
 
     _paint(model) {
-      const { view } = this, { arrays } = this.payload, { stage, about } = this.context;
+      const { view } = this, { arrays } = this.payload, { stage } = this.context;
       if (this.scan) stage.a.paint("scan", null);
       model.paint("model", null);
       stage.bar(null);
       stage.legend(null);
       this.shared = null;
       if (view.moment !== null || view.colour === "plain") {
-        const both = [...(this.scan ? [["scan", about.scan_colour]] : []), ["model", about.model_colour]];
+        const both = [...(this.scan ? [["scan", Shapespace.colours.scan]] : []), ["model", Shapespace.colours.model]];
         const opaque = view.scanOpacity > 0.99 && view.modelOpacity > 0.99;
         stage.legend(view.layout === "overlay" ? both : null, opaque && this.scan ? NEARER : "");
         return;
       }
       if (view.colour === "regions") {
-        model.paint("model", arrays.regions, { categories: REGION_CODES.map((name) => about.region_colours[name]) });
-        stage.legend(REGION_CODES.map((name) => [REGIONS[name], about.region_colours[name]]));
+        model.paint("model", arrays.regions, { categories: REGION_CODES.map((name) => Shapespace.colours.regions[name]) });
+        stage.legend(REGION_CODES.map((name) => [REGIONS[name], Shapespace.colours.regions[name]]));
         return;
       }
       if (view.colour === "colour") {
@@ -184,7 +183,7 @@
       }
       const onModel = view.colour === "model";
       const values = arrays[onModel ? `model_to_scan_${view.stage}` : `scan_to_model_${view.stage}`];
-      const { diverging, sequential, unknown_colour: unknown, signal_colour: signal } = about;
+      const { diverging, sequential, unknown, signal } = Shapespace.colours;
       const scale = Shapespace.distanceScale(this.payload.facts, values, onModel, { diverging, sequential, unknown });
       const options = { map: scale.map, range: scale.range, threshold: view.marked ? view.threshold : null, signal, unknown };
       if (onModel) model.paint("model", values, options);

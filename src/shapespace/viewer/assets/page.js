@@ -1,12 +1,9 @@
-/* What the viewer's pages share: elements, messages, talking to the server, the theme. */
+/* What all parts of the page share: elements, messages, talking to the server, the theme, components in their own roots. */
 (function () {
   "use strict";
 
   const Viewer = (window.ShapespaceViewer = window.ShapespaceViewer || {});
   const $ = (id) => document.getElementById(id);
-
-  // Inside the studio, whose own header has the name and the theme.
-  try { if (parent !== window && parent.ShapespaceStudio) document.documentElement.dataset.inStudio = ""; } catch (refused) { /* a page of another origin */ }
 
   /** Return an element: h("button", {type: "button", onclick}, "text", child, ...). */
   const h = (Viewer.h = function (tag, properties, ...children) {
@@ -50,13 +47,14 @@
     for (const kind of ["click", "input", "change"]) {
       addEventListener(kind, (event) => {
         const before = alerts;
-        if (event.target.closest && event.target.closest(control)) setTimeout(() => { if (alerts === before && !running) quiet(); }, 0);
+        const [target] = event.composedPath(); // also inside a component
+        if (target.closest && target.closest(control)) setTimeout(() => { if (alerts === before && !running) quiet(); }, 0);
       }, true);
     }
     addEventListener("keydown", (event) => { if (event.key === "Escape") quiet(); });
   }
 
-  const UNREACHABLE = "The viewer's server does not answer; see whether shapespace view still runs, then reload the page.";
+  const UNREACHABLE = "The server does not answer; see whether shapespace still runs, then reload the page.";
 
   /** fetch, with the server's own sentence as the error. */
   async function ask(path, options) {
@@ -98,6 +96,50 @@
   const binary = async (path) => Shapespace.unpack(await (await ask(path)).arrayBuffer());
   const post = (content) => ({ method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(content) });
 
+  // Components ------------------------------------------------------------------------------------------------------
+
+  const loaded = new Map(); // name of a script -> when it has run
+
+  /** Load scripts one after the other, each once. */
+  function load(...names) {
+    return names.reduce((before, name) => before.then(() => {
+      if (!loaded.has(name)) loaded.set(name, new Promise((resolve, reject) => {
+        document.head.append(h("script", { src: `/assets/${name}.js`, onload: resolve, onerror: () => { loaded.delete(name); reject(new Error(UNREACHABLE)); } }));
+      }));
+      return loaded.get(name);
+    }), Promise.resolve());
+  }
+
+  /** Return an element's own root with style sheets and `content`, once these have loaded; names and styles in it are its own. */
+  async function mount(element, styles, content) {
+    const root = element.shadowRoot || element.attachShadow({ mode: "open" });
+    const links = styles.map((name) => h("link", { rel: "stylesheet", href: `/assets/${name}.css` }));
+    const ready = links.map((link) => new Promise((resolve) => { link.onload = link.onerror = resolve; }));
+    root.replaceChildren(...links);
+    await Promise.all(ready);
+    root.append(content);
+    return root;
+  }
+
+  const round = (value) => Number(value.toFixed(4));
+
+  const numbersOf = (state) => [state.yaw, state.pitch, state.roll, state.zoom, ...state.target, ...state.extent].map(round);
+
+  /** Return the camera of a view as text of an address: yaw, pitch, roll, zoom, target and extent; empty at home. */
+  function cameraOf(view) {
+    const { home, state } = view._camera;
+    const text = numbersOf(state).join();
+    return home && numbersOf(home).join() === text ? "" : text;
+  }
+
+  function setCamera(view, text) {
+    const [yaw, pitch, roll, zoom, ...rest] = (text || "").split(",").map(Number);
+    if (rest.length !== 6 || ![yaw, pitch, roll, zoom, ...rest].every(Number.isFinite) || !(Math.min(zoom, ...rest.slice(3)) > 0)) return;
+    view.camera = { yaw, pitch, roll, zoom, target: rest.slice(0, 3), extent: rest.slice(3) };
+  }
+
+  const template = (name) => document.getElementById(name).content.cloneNode(true);
+
   // The rest --------------------------------------------------------------------------------------------------------
 
   /** The button that switches colours; `changed` is called after. */
@@ -112,5 +154,5 @@
     });
   }
 
-  Object.assign(Viewer, { $, alertUser, ask, telling, guarded, json, binary, post, startMessages, startTheme });
+  Object.assign(Viewer, { $, alertUser, ask, telling, guarded, json, binary, post, startMessages, startTheme, load, mount, template, cameraOf, setCamera });
 })();

@@ -2,7 +2,7 @@
 (function () {
   "use strict";
 
-  const { html, useState, useEffect, useRef, useMemo } = window.Preact;
+  const { html, useState, useEffect, useRef } = window.Preact;
   const Studio = window.ShapespaceStudio;
   const T = window.ShapespaceTexts;
   const J = T.jobs;
@@ -189,18 +189,15 @@
     return html`<div class="fill scroll" role="region" aria-label=${job.output} tabindex="0" data-testid=${`result-${job.number}`}>${pictures.map(([address, path]) => html`<img class="plot" key=${path} src=${address} alt=${path} />`)}<pre class="words">${words}</pre></div>`;
   }
 
-  /** Result of a job in a frame; reports are documents of their own and run apart from this page. */
-  function ResultFrame({ job, frame }) {
-    const [at, setAt] = useState(0);
-    const view = job.views[Math.min(at, job.views.length - 1)];
-    // A report takes the theme from its address, and later ones from messages, as it is a document apart.
-    const address = useMemo(() => (view && view.kind === "report" ? `${view.href}#in-studio-${Studio.theme()}${job.sentences.length ? "-answer" : ""}` : view && view.href), [view && view.href]);
+  /** Result of a job, with a choice of its views; on: see `Studio.Pane`. */
+  function Result({ job, on }) {
+    const [kind, setKind] = useState(Studio.place().place.view);
+    const view = job.views.find((one) => one.kind === kind) || job.views[0];
     if (!view) return html`<${Summary} job=${job} />`;
-    const sandbox = view.kind === "report" ? "allow-scripts allow-downloads allow-popups" : undefined;
     return html`
       <div class="frame" data-testid=${`result-${job.number}`}>
-        ${job.views.length > 1 && html`<div class="segments" role="group" aria-label=${J.view}>${job.views.map((one, k) => html`<button type="button" aria-pressed=${k === at} data-testid=${`view-${one.kind}`} onclick=${() => setAt(k)}>${J.views[one.kind]}</button>`)}</div>`}
-        <iframe key=${view.href} ref=${frame} src=${address} sandbox=${sandbox} data-testid="frame" title=${J.frame(J.views[view.kind] || view.kind, job.output)}></iframe>
+        ${job.views.length > 1 && html`<div class="segments" role="group" aria-label=${J.view}>${job.views.map((one) => html`<button type="button" aria-pressed=${one === view} data-testid=${`view-${one.kind}`} onclick=${() => setKind(one.kind)}>${J.views[one.kind]}</button>`)}</div>`}
+        <${Studio.Pane} key=${view.href} view=${view} result=${job.number} name=${J.shown(J.views[view.kind], job.output)} on=${{ ...on, isAnswer: job.sentences.length > 0 }} />
       </div>`;
   }
 
@@ -209,10 +206,13 @@
     <p class="outdated" role="status" data-testid=${`outdated-${job.number}`}><strong>${J.outdated[job.outdated]}</strong>
       ${job.outdated !== "source" && html` <${Button} edits small testid=${`again-${job.number}`} disabled=${Studio.jobsOf([job.kind]).some(Studio.isActive)} onclick=${() => Studio.runJob(job.kind, job.options, job.outdated === "redone" ? null : job.on)}>${J.sameSettings}<//>`}</p>`;
 
-  /** The results of `kinds`, `first` or the newest at first; returns the chosen job and the select. */
-  function useResult(kinds, first = null) {
-    const [chosen, setChosen] = useState(first);
+  const reportOf = (job) => job.views.find((view) => view.kind === "report");
+
+  /** The results of `kinds`, that of the address or the newest at first; returns the chosen job and the select. */
+  function useResult(kinds) {
+    const [chosen, setChosen] = useState(Number(Studio.place().place.result) || null);
     const seen = useRef(undefined);
+    const choose = (number) => { const { screen, place } = Studio.place(); Studio.goTo(screen, { question: place.question, result: number }); };
     const finished = Studio.jobsOf(kinds).filter((job) => job.status === "done");
     const job = finished.find((one) => one.number === chosen) || finished[0] || null;
     const newest = finished.length ? finished[0].number : null;
@@ -222,10 +222,10 @@
     }, [newest]);
     const select = job && html`
       <div class="row bar result-bar">
-        ${finished.length > 1 ? html`<label>${J.result} <select data-testid="result" value=${job.number} onchange=${(event) => setChosen(Number(event.target.value))}>
+        ${finished.length > 1 ? html`<label>${J.result} <select data-testid="result" value=${job.number} onchange=${(event) => choose(Number(event.target.value))}>
           ${finished.map((one) => html`<option key=${one.number} value=${one.number} selected=${one === job}>${kindOf(one)}, ${titleOf(one)}</option>`)}</select></label>` : html`<strong>${kindOf(job)}</strong>`}
         <span class="grow"></span>
-        ${job.views.length > 0 && html`<a href=${job.views[0].href} target="_blank" rel="noopener" data-testid="open-result">${J.full}</a>`}
+        ${reportOf(job) && html`<a href=${reportOf(job).href} target="_blank" rel="noopener" data-testid="open-result">${J.full}</a>`}
         <${Outdated} job=${job} />
       </div>`;
     return [job, select];
@@ -255,5 +255,5 @@
       ${Studio.isActive(job) && html`<${Button} edits small testid=${`elsewhere-cancel-${job.number}`} onclick=${() => Studio.act(`/api/jobs/${job.number}/cancel`)}>${J.cancel}<//>`}</p>`)}</div>`;
   };
 
-  Object.assign(Studio, { Elsewhere, Outdated, duration, action, kindOf, JobForm, JobPanel, ResultFrame, Settings, Jobs, useResult });
+  Object.assign(Studio, { Elsewhere, Outdated, duration, action, kindOf, JobForm, JobPanel, Result, Settings, Jobs, useResult });
 })();

@@ -2,7 +2,7 @@
 (function () {
   "use strict";
 
-  const { html, useState } = window.Preact;
+  const { html } = window.Preact;
   const Studio = window.ShapespaceStudio;
   const T = window.ShapespaceTexts;
   const Q = T.questions;
@@ -23,8 +23,8 @@
       <div class="row"><${Button} edits small testid="figures" onclick=${() => Studio.runFigures(job)}>${Q.figures}<//></div>
     </div>`;
 
-  function Question({ kind, first, next, onback }) {
-    const [job, select] = useResult([kind], first);
+  function Question({ kind, next, onback }) {
+    const [job, select] = useResult([kind]);
     const ready = Boolean(Studio.newest(...sources(kind)));
     const busy = Studio.jobsOf([kind]).some(Studio.isActive);
     const controls = html`
@@ -38,18 +38,19 @@
   }
 
   Studio.Questions = function Questions({ next }) {
-    const [{ kind, first }, setQuestion] = useState({});
-    if (kind) return html`<${Question} key=${kind} kind=${kind} first=${first} next=${next} onback=${() => setQuestion({})} />`;
+    const { question: kind } = Studio.place().place;
+    const ask = (question, result) => Studio.goTo("questions", { question, result });
+    if (KINDS.includes(kind)) return html`<${Question} key=${kind} kind=${kind} next=${next} onback=${() => ask()} />`;
     const earlier = Studio.newestOfEach(Studio.jobsOf(KINDS));
     return html`
       <div class="fill scroll" data-testid="screen-questions">
         <div class="row bar"><h2>${Q.title}</h2><span class="grow"></span>
           ${earlier.some((job) => job.status === "done") && html`<${Button} strong testid="next" onclick=${next}>${T.next.questions}<//>`}</div>
         <ul class="questions">
-          ${KINDS.filter((one) => Studio.forms[one] && !Studio.state.read_only).map((one) => html`<li key=${one}><button type="button" data-testid=${`question-${one}`} onclick=${() => setQuestion({ kind: one })}><strong>${Studio.action(one)}</strong><span class="hint">${hint(one)}</span></button></li>`)}
+          ${KINDS.filter((one) => Studio.forms[one] && !Studio.state.read_only).map((one) => html`<li key=${one}><button type="button" data-testid=${`question-${one}`} onclick=${() => ask(one)}><strong>${Studio.action(one)}</strong><span class="hint">${hint(one)}</span></button></li>`)}
         </ul>
         ${earlier.length > 0 && html`<h3>${Q.earlier}</h3>
-          <ul class="recent">${earlier.map((job) => html`<li key=${job.number}><button type="button" data-testid=${`earlier-${job.number}`} onclick=${() => setQuestion({ kind: job.kind, first: job.number })}>
+          <ul class="recent">${earlier.map((job) => html`<li key=${job.number}><button type="button" data-testid=${`earlier-${job.number}`} onclick=${() => ask(job.kind, job.number)}>
             <strong>${Studio.kindOf(job)}</strong><span>${Studio.titleOf(job)}${job.outdated ? html` <span class="tag">${T.jobs.isOutdated}</span>` : ""}</span><span class="hint">${T.jobs.statuses[job.status]}${job.sentences.length ? `: ${job.sentences[0]}` : ""}</span></button></li>`)}</ul>`}
       </div>`;
   };

@@ -2,32 +2,23 @@
 (function () {
   "use strict";
 
-  const { html, useState, useEffect, useRef } = window.Preact;
+  const { html, useState, useEffect } = window.Preact;
   const Studio = window.ShapespaceStudio;
   const T = window.ShapespaceTexts;
   const LEAST = 2; // scans that can be brought into correspondence
-  const { Button, JobForm, Jobs, Settings, ResultFrame, useResult, DropZone, UploadStatus } = Studio;
+  const { Button, JobForm, Jobs, Settings, Result, useResult, DropZone, UploadStatus } = Studio;
 
   /** Controls on the left, the result on the right. */
-  const Step = (Studio.Step = function Step({ name, title, controls, select, job, empty, children, frame }) {
+  const Step = (Studio.Step = function Step({ name, title, controls, select, job, empty, children, on }) {
     return html`
       <div class="step" data-testid=${`screen-${name}`}>
         <section class="side" aria-label=${title}>${controls}</section>
-        <section class="result" aria-label=${T.jobs.result}>${job ? html`${select}${children}<${ResultFrame} key=${job.number} job=${job} frame=${frame} />` : html`<p class="empty hint">${empty}</p>`}</section>
+        <section class="result" aria-label=${T.jobs.result}>${job ? html`${select}${children}<${Result} key=${job.number} job=${job} on=${on} />` : html`<p class="empty hint">${empty}</p>`}</section>
       </div>`;
   });
 
   const Next = ({ name, next, ready }) => html`<${Button} class="wide" strong=${ready} testid="next" onclick=${next}>${T.next[name]}<//>`;
   const isBusy = (...kinds) => Studio.jobsOf(kinds).some(Studio.isActive);
-
-  /** Take the messages of the page in a frame; a report in it has no origin. */
-  function useMessages(frame, take) {
-    useEffect(() => {
-      const listen = (event) => { if (frame.current && event.source === frame.current.contentWindow && event.data) take(event); };
-      addEventListener("message", listen);
-      return () => removeEventListener("message", listen);
-    });
-  }
 
   // Correspondence --------------------------------------------------------------------------------------------------
 
@@ -43,7 +34,7 @@
       </details>`;
   }
 
-  /** Named vertices; the surfaces' page reports the vertex that was clicked last, and landmarks that were dragged. */
+  /** Named vertices; `clicked` is the vertex that was clicked last on the surfaces. */
   function Landmarks({ landmarks, elsewhere, clicked, save }) {
     const [name, setName] = useState("");
     const [vertex, setVertex] = useState("");
@@ -69,28 +60,21 @@
   }
 
   Studio.Correspondence = function Correspondence({ project, next }) {
-    const frame = useRef(null);
     const [clicked, setClicked] = useState(null);
     const [job, select] = useResult(["correspond", "redo"]);
     // Landmarks belong to the surfaces that they were placed on.
     const elsewhere = job && Object.keys(project.landmarks).length && ![job.output, ""].includes(project.landmarks_on) ? project.landmarks_on : "";
     const landmarks = elsewhere ? {} : project.landmarks;
-    const show = () => {
-      const list = Object.entries(landmarks).map(([name, vertex]) => ({ name, vertex }));
-      if (frame.current) frame.current.contentWindow.postMessage({ landmarks: list }, location.origin);
-    };
+    const [refused, setRefused] = useState(0); // edits that were refused, after which landmarks are drawn where they were
     const save = async (changed) => {
       const done = !Studio.state.read_only && (await Studio.edit({ what: "landmarks", landmarks: changed, on: job.output }));
-      if (!done) show();
+      if (!done) setRefused(refused + 1);
       return done;
     };
-    useEffect(show, [JSON.stringify(landmarks)]);
-    useMessages(frame, ({ origin, data }) => {
-      if (origin !== location.origin) return;
-      if (data.ready) show();
-      else if (data.landmark !== undefined) save({ ...landmarks, [data.landmark]: data.vertex });
-      else if (Number.isInteger(data.vertex)) setClicked(data.vertex);
-    });
+    const on = {
+      landmarks: Object.entries(landmarks).map(([name, vertex]) => ({ name, vertex, refused })),
+      onvertex: setClicked, onlandmark: (name, vertex) => save({ ...landmarks, [name]: vertex }),
+    };
     const training = project.specimens.filter((one) => one.included && one.set === "training" && one.state !== "unusable");
     const busy = isBusy("correspond", "redo");
     const controls = html`
@@ -100,25 +84,18 @@
       ${job && html`<${Next} name="correspondence" next=${next} ready=${!busy} />`}
       <${Settings} key="settings" kinds=${["correspond"]}><${JobForm} kind="correspond" strong=${!job && !busy} disabled=${training.length < LEAST || busy} /><//>
       ${job && html`<${Redo} specimens=${training} /><${Landmarks} landmarks=${landmarks} elsewhere=${elsewhere} clicked=${clicked} save=${save} />`}`;
-    return html`<${Step} name="correspondence" title=${T.correspondence.title} controls=${controls} select=${select} job=${job} empty=${T.correspondence.empty} frame=${frame} />`;
+    return html`<${Step} name="correspondence" title=${T.correspondence.title} controls=${controls} select=${select} job=${job} empty=${T.correspondence.empty} on=${on} />`;
   };
 
   // Model -----------------------------------------------------------------------------------------------------------
 
   const More = ({ kind, ...rest }) => Studio.forms[kind] && !Studio.state.read_only ? html`<details data-testid=${`more-${kind}`}><summary>${Studio.action(kind)}</summary><p class="hint">${Studio.forms[kind].summary}</p><${JobForm} kind=${kind} ...${rest} /></details>` : null;
 
-  /** The specimens that are selected in a frame's morphospace. */
-  function useSelected(frame, specimens) {
-    const [names, setNames] = useState([]);
-    useMessages(frame, ({ data }) => { if (Array.isArray(data.selected)) setNames(data.selected); });
-    return [specimens.filter((one) => names.includes(one.id)), () => setNames([])];
-  }
-
   Studio.Model = function Model({ project, next, go }) {
     const kinds = ["build", "quality", "morphospace"];
-    const frame = useRef(null);
     const [job, select] = useResult(kinds);
-    const [selected, clear] = useSelected(frame, project.specimens);
+    const [names, setNames] = useState([]); // those that are selected in the morphospace
+    const selected = project.specimens.filter((one) => names.includes(one.id));
     const ready = Boolean(Studio.newest("correspond", "redo"));
     const built = Boolean(Studio.newest("build"));
     const sources = ["correspond", "redo"];
@@ -129,8 +106,8 @@
       ${built && html`<div class="row nexts"><${Next} name="model" next=${next} ready=${!isBusy("build")} /><${Button} class="wide" testid="go-fit" onclick=${() => go("fit")}>${T.fitNext}<//></div>`}
       <${Settings} key="settings" kinds=${["build"]}><${JobForm} kind="build" sources=${sources} strong=${ready && !built && !isBusy("build")} disabled=${!ready || isBusy("build")} /><//>
       ${ready && html`<${More} kind="quality" sources=${sources} disabled=${isBusy("quality")} /><${More} kind="morphospace" sources=${sources} defaults=${{ "--group": Object.keys(project.counts)[0] || "" }} disabled=${isBusy("morphospace")} />`}`;
-    return html`<${Step} name="model" title=${T.model.title} controls=${controls} select=${select} job=${job} empty=${T.model.empty} frame=${frame}>
-      ${selected.length > 0 && html`<${Studio.SelectionBar} selected=${selected} onclear=${clear} />`}<//>`;
+    return html`<${Step} name="model" title=${T.model.title} controls=${controls} select=${select} job=${job} empty=${T.model.empty} on=${{ onselected: setNames }}>
+      ${selected.length > 0 && html`<${Studio.SelectionBar} selected=${selected} onclear=${() => setNames([])} />`}<//>`;
   };
 
   // Fit -------------------------------------------------------------------------------------------------------------

@@ -88,7 +88,7 @@
       progress: ({ doing, done, total }) => total ? `${doing} (${done} of ${total})` : doing, progressLabel: (kind) => `Progress of: ${kind}`,
       took: (time) => `took ${time}`, left: (time) => `about ${time} left in this step`,
       seconds: (value) => `${value} s`, minutes: (value) => `${value} min`, hours: (value) => `${value} h`,
-      frame: (kind, output) => `${kind}: ${output}`, openReport: "Open the report", full: "Open in a tab of its own", views: { surfaces: "Surfaces", model: "3-D view", report: "Report" }, view: "View",
+      shown: (kind, output) => `${kind}: ${output}`, noReport: "This report cannot be shown here; open it in a tab of its own.", openReport: "Open the report", full: "Open in a tab of its own", views: { surfaces: "Surfaces", model: "3-D view", report: "Report" }, view: "View",
     },
     correspondence: {
       title: "Correspondence", intro: (number) => `${count(number, "included specimen")} for training. Each gets the same vertices, so that shapes can be compared.`,

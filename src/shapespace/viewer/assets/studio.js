@@ -16,9 +16,7 @@
   const KINDS = { correspondence: ["correspond", "redo"], model: ["build", "quality", "morphospace"], fit: ["fit", "complete"], questions: Studio.QUESTIONS, export: ["report", "convert", "export", "figures"] };
   const AFTER = { specimens: "correspondence", correspondence: "model", model: "questions", fit: "questions", questions: "export" };
 
-  Studio.theme = () => document.documentElement.dataset.theme || (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
-
-  const ofAddress = () => (NAMES.includes(location.hash.slice(1)) ? location.hash.slice(1) : NAMES[0]);
+  const ofAddress = () => { const { screen } = Studio.place(); return NAMES.includes(screen) ? screen : NAMES[0]; };
 
   /** Whether a screen's jobs run or have succeeded. */
   function progressOf(name) {
@@ -27,14 +25,27 @@
     return jobs.some((job) => job.status === "done") ? "done" : null;
   }
 
-  function Project({ project }) {
-    const [screen, setScreen] = useState(ofAddress());
-    const go = (name) => { location.hash = name; setScreen(name); };
+  /** The number of steps through the addresses of this page; each shows its screen anew. */
+  function useVisit() {
+    const [visit, setVisit] = useState(0);
     useEffect(() => {
-      const changed = () => setScreen(ofAddress());
+      const changed = () => setVisit((count) => count + 1);
       addEventListener("hashchange", changed);
       return () => removeEventListener("hashchange", changed);
     }, []);
+    return visit;
+  }
+
+  /** A single result, without a project. */
+  function Single({ result }) {
+    const visit = useVisit();
+    return html`<main><div id="screen" class="single" tabindex="-1"><${Studio.Result} key=${visit} job=${result} /></div></main>`;
+  }
+
+  function Project({ project }) {
+    const visit = useVisit();
+    const screen = ofAddress();
+    const go = (name) => Studio.goTo(name);
     const next = () => { go(AFTER[screen]); document.getElementById(`tab-${AFTER[screen]}`).focus(); };
     const Screen = SCREENS[screen];
     return html`
@@ -50,21 +61,22 @@
       </nav>
       <${Studio.Elsewhere} kinds=${screen === "history" ? project.jobs.map((job) => job.kind) : KINDS[screen] || []} />
       <main>
-        <div id="screen" role="tabpanel" tabindex="-1" aria-labelledby=${`tab-${screen}`} data-screen=${screen}><${Screen} key=${screen} project=${project} go=${go} next=${next} /></div>
+        <div id="screen" role="tabpanel" tabindex="-1" aria-labelledby=${`tab-${screen}`} data-screen=${screen}><${Screen} key=${`${screen} ${visit}`} project=${project} go=${go} next=${next} /></div>
       </main>`;
   }
 
   function App() {
-    const { project, recent } = Studio.state;
+    const { project, result, recent } = Studio.state;
+    if (result) return html`<${Single} result=${result} />`;
     return project ? html`<${Project} key=${project.folder} project=${project} />` : html`<${Start} recent=${recent} />`;
   }
 
   function draw() {
-    const { project } = Studio.state;
-    const about = document.getElementById("about");
-    about.textContent = project ? `${project.name}${Studio.state.read_only ? T.readOnly : ""}` : "";
+    const { project, result } = Studio.state;
+    const about = document.getElementById("about"), name = result ? result.output : project ? project.name : "";
+    about.textContent = project && Studio.state.read_only ? `${name}${T.readOnly}` : name;
     about.title = project ? project.folder : "";
-    document.title = project ? `${project.name}, shapespace studio` : "shapespace studio";
+    document.title = `${name && `${name}, `}shapespace${result ? "" : " studio"}`;
     render(html`<${App} />`, document.getElementById("app"));
     document.body.dataset.ready = "true";
   }
@@ -92,16 +104,14 @@
   async function start() {
     startDrawing();
     Viewer.startMessages();
-    Viewer.startTheme(() => {
-      // Pages in frames take the theme when they are loaded; their own button, which is hidden there, switches it later.
-      for (const frame of document.querySelectorAll("iframe[sandbox]")) frame.contentWindow.postMessage({ theme: Studio.theme() }, "*");
-      for (const frame of document.querySelectorAll("iframe:not([sandbox])")) frame.contentDocument.getElementById("theme")?.click();
-    });
+    Viewer.startTheme(() => document.dispatchEvent(new Event("shapespace:theme")));
     addEventListener("keydown", shortcut);
     // A file that misses the drop zone would replace the page.
     addEventListener("dragover", (event) => event.preventDefault());
     addEventListener("drop", (event) => event.preventDefault());
     addEventListener("beforeunload", (event) => { if (Studio.uploading()) event.preventDefault(); });
+    Studio.state = await Studio.json("/api/project");
+    if (Studio.state.result) { draw(); return; } // which nothing changes
     Studio.forms = await Studio.json("/api/forms");
     Studio.QUESTIONS.push(...Object.keys(Studio.forms).filter((kind) => Studio.forms[kind].is_question));
     await Studio.refresh();

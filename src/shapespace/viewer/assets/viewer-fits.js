@@ -3,18 +3,16 @@
   "use strict";
 
   const Viewer = window.ShapespaceViewer;
-  const { $, h, page, guarded, json, binary } = Viewer;
+  const { h, guarded } = Viewer;
   const FILTERED_FROM = 12;
   const STATUS = {
     converged: "No problems detected", doubtful: "Do not trust this fit", max_iterations: "The fit was cut off",
-    failed: "The scan could not be fitted", unreadable: "This result cannot be read", stopped: "The fit was stopped",
+    failed: "The scan could not be fitted", unreadable: "This result cannot be read",
   };
 
-  let selected = -1;
-
-  function verdictCard(facts, where) {
+  function verdictCard(facts) {
     const notes = facts.notes && facts.notes.length ? h("ul", {}, ...facts.notes.map((note) => h("li", {}, note))) : null;
-    return h("div", { class: `status ${facts.status}`, "data-testid": `${where}-status`, "data-status": facts.status },
+    return h("div", { class: `status ${facts.status}`, "data-testid": "fit-status", "data-status": facts.status },
       h("strong", {}, STATUS[facts.status] || facts.status), h("span", {}, plainReason(facts.reason || "")), notes);
   }
 
@@ -48,92 +46,99 @@
     return row.scan_to_model_mm === null ? row.status : `${row.scan_to_model_mm.toFixed(2)} mm`;
   }
 
-  async function start() {
-    $("fits-none").hidden = page.about.has_fits;
-    if (window.parent !== window) $("fits-none").textContent = "This page shows a model without fits."; // in the studio or a notebook
-    $("fits-some").hidden = !page.about.has_fits;
-    if (!page.about.has_fits) return;
-    page.fits = await json("api/fits");
-    Viewer.compareTab.fillChoices();
-    $("fit-filter-label").hidden = page.fits.length <= FILTERED_FROM;
-    $("fit-filter").addEventListener("input", filterFits);
-    $("fit-list").replaceChildren(...page.fits.map((row, i) => h("div", {
-      role: "option", id: `fit-${i}`, class: row.status, "aria-selected": "false", "data-testid": "fit", "data-name": row.name,
-      title: row.reason, onclick: () => selectFit(i),
-    }, h("i", { class: "dot" }), h("span", {}, row.label, h("b", { hidden: true }, ` ${row.status}`)),
-    h("small", {}, shortly(row)))));
-    $("fit-list").addEventListener("keydown", (event) => {
-      const step = { ArrowDown: 1, ArrowUp: -1 }[event.key];
-      if (!step) return;
-      event.preventDefault();
-      for (let i = selected + step; i >= 0 && i < page.fits.length; i += step) {
-        if (!$(`fit-${i}`).hidden) { selectFit(i); return; }
+  /** The tab of `page`, see `Viewer.openModel`. */
+  Viewer.makeFitsTab = function (page) {
+    const { $ } = page;
+    let selected = -1;
+
+    async function start(name) {
+      $("tab-fits").hidden = !page.about.has_fits;
+      if (!page.about.has_fits) return;
+      page.fits = await Viewer.json(`${page.base}api/fits`);
+      page.compareTab.fillChoices();
+      $("fit-filter-label").hidden = page.fits.length <= FILTERED_FROM;
+      $("fit-filter").addEventListener("input", filterFits);
+      $("fit-list").replaceChildren(...page.fits.map((row, i) => h("div", {
+        role: "option", id: `fit-${i}`, class: row.status, "aria-selected": "false", "data-testid": "fit", "data-name": row.name,
+        title: row.reason, onclick: () => selectFit(i),
+      }, h("i", { class: "dot" }), h("span", {}, row.label, h("b", { hidden: true }, ` ${row.status}`)),
+      h("small", {}, shortly(row)))));
+      $("fit-list").addEventListener("keydown", (event) => {
+        const step = { ArrowDown: 1, ArrowUp: -1 }[event.key];
+        if (!step) return;
+        event.preventDefault();
+        for (let i = selected + step; i >= 0 && i < page.fits.length; i += step) {
+          if (!$(`fit-${i}`).hidden) { selectFit(i); return; }
+        }
+      });
+      const isDoubtful = (row) => row.status !== "converged";
+      const go = (step) => {
+        for (let i = 1; i <= page.fits.length; i++) {
+          const at = (((selected < 0 && step < 0 ? 0 : selected) + step * i) % page.fits.length + page.fits.length) % page.fits.length;
+          if (isDoubtful(page.fits[at])) { selectFit(at); return; }
+        }
+      };
+      $("fit-next").addEventListener("click", () => go(1));
+      $("fit-previous").addEventListener("click", () => go(-1));
+      const count = page.fits.filter(isDoubtful).length;
+      $("fit-next").disabled = $("fit-previous").disabled = count === 0;
+      if (!count) $("fit-next").title = $("fit-previous").title = "No fit is doubtful";
+      selected = page.fits.findIndex((row) => row.name === name);
+    }
+
+    /** The fit to open on: the first good one that can be drawn, or else the first that can. */
+    function firstFit() {
+      const good = page.fits.findIndex((row) => row.pictured && row.status === "converged");
+      return Math.max(0, good >= 0 ? good : page.fits.findIndex((row) => row.pictured));
+    }
+
+    /** Show the fits whose name, label or status contains the typed text. */
+    function filterFits() {
+      const wanted = $("fit-filter").value.trim().toLowerCase();
+      let left = 0;
+      page.fits.forEach((row, i) => {
+        const fits = `${row.label}\n${row.name}\n${row.status}`.toLowerCase().includes(wanted);
+        $(`fit-${i}`).hidden = !fits;
+        left += fits ? 1 : 0;
+      });
+      $("fit-filter-said").textContent = wanted ? `${left} of ${page.fits.length} fits` : "";
+    }
+
+    const selectFit = guarded(async (index) => {
+      selected = index;
+      page.onplace();
+      const row = page.fits[index];
+      for (const option of $("fit-list").children) option.setAttribute("aria-selected", String(option.id === `fit-${index}`));
+      $("fit-list").setAttribute("aria-activedescendant", `fit-${index}`);
+      $(`fit-${index}`).scrollIntoView({ block: "nearest" });
+      const detail = h("div");
+      page.fitView.clear();
+      page.fitView.element = detail;
+      $("fit-detail").replaceChildren(...[verdictCard(row), distanceFacts(row), detail].filter(Boolean));
+      if (!row.pictured) {
+        if (row.why_not) $("fit-detail").append(h("p", {}, row.why_not));
+        if (row.z) $("fit-detail").append(h("button", { type: "button", onclick: () => page.apply(row.z) }, "Use in Model"));
+        if (page.shown === "fits") page.stage.nothing(`There is no picture of ${row.label}`);
+        return;
+      }
+      $("loading").textContent = "Loading the fit";
+      $("loading").hidden = false;
+      try {
+        const payload = await Viewer.binary(`${page.base}api/fits/${encodeURIComponent(row.name)}`);
+        if (selected !== index) return;
+        page.fitView.show(payload, { fit: row.name });
+      } finally {
+        $("loading").hidden = true;
       }
     });
-    const isDoubtful = (row) => row.status !== "converged";
-    const go = (step) => {
-      for (let i = 1; i <= page.fits.length; i++) {
-        const at = (((selected < 0 && step < 0 ? 0 : selected) + step * i) % page.fits.length + page.fits.length) % page.fits.length;
-        if (isDoubtful(page.fits[at])) { selectFit(at); return; }
-      }
-    };
-    $("fit-next").addEventListener("click", () => go(1));
-    $("fit-previous").addEventListener("click", () => go(-1));
-    const count = page.fits.filter(isDoubtful).length;
-    $("fit-next").disabled = $("fit-previous").disabled = count === 0;
-    if (!count) $("fit-next").title = $("fit-previous").title = "No fit is doubtful";
-  }
 
-  /** The fit to open on: the first good one that can be drawn, or else the first that can. */
-  function firstFit() {
-    const good = page.fits.findIndex((row) => row.pictured && row.status === "converged");
-    return Math.max(0, good >= 0 ? good : page.fits.findIndex((row) => row.pictured));
-  }
-
-  /** Show the fits whose name, label or status contains the typed text. */
-  function filterFits() {
-    const wanted = $("fit-filter").value.trim().toLowerCase();
-    let left = 0;
-    page.fits.forEach((row, i) => {
-      const fits = `${row.label}\n${row.name}\n${row.status}`.toLowerCase().includes(wanted);
-      $(`fit-${i}`).hidden = !fits;
-      left += fits ? 1 : 0;
-    });
-    $("fit-filter-said").textContent = wanted ? `${left} of ${page.fits.length} fits` : "";
-  }
-
-  const selectFit = guarded(async (index) => {
-    selected = index;
-    const row = page.fits[index];
-    for (const option of $("fit-list").children) option.setAttribute("aria-selected", String(option.id === `fit-${index}`));
-    $("fit-list").setAttribute("aria-activedescendant", `fit-${index}`);
-    $(`fit-${index}`).scrollIntoView({ block: "nearest" });
-    const detail = h("div");
-    page.fitView.clear();
-    page.fitView.element = detail;
-    $("fit-detail").replaceChildren(...[verdictCard(row, "fit"), distanceFacts(row), detail].filter(Boolean));
-    if (!row.pictured) {
-      if (row.why_not) $("fit-detail").append(h("p", {}, row.why_not));
-      if (row.z) $("fit-detail").append(h("button", { type: "button", onclick: () => Viewer.apply(row.z) }, "Use in Model"));
-      if (page.shown === "fits") page.stage.nothing(`There is no picture of ${row.label}`);
-      return;
+    function draw() {
+      if (page.fits.length && !page.fitView.payload) return selectFit(selected >= 0 ? selected : firstFit());
+      if (page.fitView.payload) page.fitView.draw(true);
+      else page.stage.faintMean();
+      return null;
     }
-    $("loading").textContent = "Loading the fit";
-    $("loading").hidden = false;
-    try {
-      const payload = await binary(`api/fits/${encodeURIComponent(row.name)}`);
-      if (selected !== index) return;
-      page.fitView.show(payload, { fit: row.name });
-    } finally {
-      $("loading").hidden = true;
-    }
-  });
 
-  function draw() {
-    if (page.fits.length && !page.fitView.payload) selectFit(selected >= 0 ? selected : firstFit());
-    else if (page.fitView.payload) page.fitView.draw(true);
-    else page.stage.faintMean();
-  }
-
-  Viewer.fitsTab = { start, draw, verdictCard, distanceFacts, shortly };
+    return { start, draw, name: () => page.fits[selected]?.name };
+  };
 })();

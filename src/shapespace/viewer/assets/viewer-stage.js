@@ -1,43 +1,30 @@
-/* The state that the parts of the viewer share, and the stage: one or two linked views. */
+/* The stage of a model or its fits: one or two linked views, captions, colour bar and legend. */
 (function () {
   "use strict";
 
   const Viewer = window.ShapespaceViewer;
-  const { $, h } = Viewer;
-
-  /** The state that the parts of the viewer share; `begin` in viewer.js fills in what the server sends. */
-  const page = (Viewer.page = {
-    about: null, // facts of the model
-    model: null,
-    share: null, // of the variance, of each mode
-    z: null, // all coefficients of the shape in Model, standard deviations
-    stage: null,
-    shown: "model", // name of the tab
-    shapes: new Map(), // those to compare: key -> {name, z}
-    fits: [], // rows of the saved fits
-    fitView: null, scanView: null, // the fits that are drawn in Fits and in Your scan
-    own: null, // the dropped scan that is looked at
-    dropped: [], // {id, name, file, dense, states, preview, said, verdict, placing, ...}
-  });
+  const { h } = Viewer;
 
   class Stage {
-    constructor() {
-      this.a = new Shapespace.View($("view-a"), { label: "The shape in 3-D", embedded: false });
+    /** page: {$, model}, see `Viewer.openModel`. */
+    constructor(page) {
+      this.page = page;
+      this.a = new Shapespace.View(page.$("view-a"), { label: "The shape in 3-D", embedded: false });
       this.b = null;
       this.holds = null;
     }
 
     split(two) {
       if (two && !this.b) {
-        this.b = new Shapespace.View($("view-b"), { label: "The model in 3-D", embedded: false });
+        this.b = new Shapespace.View(this.page.$("view-b"), { label: "The model in 3-D", embedded: false });
         this.a.link(this.b);
       }
-      $("pane-b").hidden = !two;
+      this.page.$("pane-b").hidden = !two;
     }
 
     /** The picture as PNG; two views are side by side. */
     async picture() {
-      const views = $("pane-b").hidden ? [this.a] : [this.a, this.b];
+      const views = this.page.$("pane-b").hidden ? [this.a] : [this.a, this.b];
       const blobs = await Promise.all(views.map((view) => view.png()));
       if (blobs.length === 1) return blobs[0];
       const images = await Promise.all(blobs.map((blob) => createImageBitmap(blob)));
@@ -48,22 +35,22 @@
     }
 
     captions(a, b) {
-      $("caption-a").textContent = a || "";
-      $("caption-b").textContent = b || "";
+      this.page.$("caption-a").textContent = a || "";
+      this.page.$("caption-b").textContent = b || "";
     }
 
     bar(options) {
-      $("bar").hidden = !options;
+      this.page.$("bar").hidden = !options;
       const wanted = options ? [options.title, ...options.range, ...(options.keys || []).map(([text]) => text)].join(" ") : "";
-      if (options && this._bar !== wanted) Shapespace.colourBar($("bar"), options);
+      if (options && this._bar !== wanted) Shapespace.colourBar(this.page.$("bar"), options);
       this._bar = wanted;
     }
 
     legend(items, note) {
-      $("legend").hidden = !items;
+      this.page.$("legend").hidden = !items;
       if (!items) return;
       const rgb = (c) => `rgb(${c.map((v) => Math.round(255 * v)).join(",")})`;
-      $("legend").replaceChildren(...items.map(([text, colour]) => {
+      this.page.$("legend").replaceChildren(...items.map(([text, colour]) => {
         const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");
         const spot = document.createElementNS("http://www.w3.org/2000/svg", "circle");
         for (const [key, value] of [["cx", 6], ["cy", 6], ["r", 6], ["fill", rgb(colour)]]) spot.setAttribute(key, value);
@@ -74,9 +61,9 @@
     }
 
     clear() {
-      $("empty").hidden = true;
+      this.page.$("empty").hidden = true;
       for (const view of [this.a, this.b]) {
-        if (view) for (const id of ["model", "scan", "landmarks", "placed"]) view.remove(id);
+        if (view) for (const id of ["model", "scan", "landmarks"]) view.remove(id);
       }
       this.bar(null);
       this.legend(null);
@@ -88,13 +75,18 @@
     nothing(text) {
       this.clear();
       this.split(false);
-      $("empty").textContent = text;
-      $("empty").hidden = false;
+      this.page.$("empty").textContent = text;
+      this.page.$("empty").hidden = false;
+    }
+
+    dispose() {
+      for (const view of [this.a, this.b]) if (view) view.dispose();
     }
 
     /** Nothing to show yet: the mean, faint. */
     faintMean() {
-      this.a.setSurface("model", { positions: page.model.mean, faces: page.model.faces, colour: page.about.clay, opacity: 0.35 });
+      const { model } = this.page;
+      this.a.setSurface("model", { positions: model.mean, faces: model.faces, colour: Shapespace.colours.clay, opacity: 0.35 });
       this.holds = "empty";
       this.a.frame(["model"]);
     }

@@ -1,93 +1,140 @@
-/* The viewer's page: its tabs, and its start. */
+/* A model, and fits by it: the tabs Model, Compare and Fits beside one stage. */
 (function () {
   "use strict";
 
   const Viewer = window.ShapespaceViewer;
-  const { $, page, modelTab, compareTab, fitsTab, scanTab, uploads, landmarks, save, alertUser, guarded, json, binary } = Viewer;
-  const TABS = ["model", "compare", "fits", "scan"];
+  const { save, guarded } = Viewer;
+  const TABS = ["model", "compare", "fits"];
 
-  window.shapespaceReady = false;
-
-  let isChosen = false; // whether the user chose a tab before the fits were there
-  window.shapespaceTimes = []; // ms from a slider's event to the picture, as drawn
-
-  function show(name) {
-    page.shown = name;
-    modelTab.stop();
-    compareTab.stop();
-    for (const tab of TABS) {
-      $(`tab-${tab}`).setAttribute("aria-selected", String(tab === name));
-      $(`tab-${tab}`).tabIndex = tab === name ? 0 : -1;
-      $(tab).hidden = tab !== name;
+  /** Return "2:-1.5,3:0.2" for coefficients z, and the reverse; modes that are 0 are omitted. */
+  const textOf = (z) => Array.from(z, (value, k) => [k + 1, Number(value.toFixed(4))]).filter(([, value]) => value).map((pair) => pair.join(":")).join();
+  function coefficientsOf(text, count) {
+    const z = new Float64Array(count);
+    for (const [mode, value] of (text || "").split(",").map((pair) => pair.split(":").map(Number))) {
+      if (Number.isInteger(mode) && mode >= 1 && mode <= count && Number.isFinite(value)) z[mode - 1] = value;
     }
-    page.fitView.stop();
-    page.scanView.stop();
-    page.fitView.active = name === "fits";
-    page.scanView.active = name === "scan" && !(page.own && page.own.placing);
-    if (name === "model") modelTab.draw();
-    else if (name === "compare") compareTab.draw(true);
-    else {
-      page.stage.clear();
-      page.stage.split(false);
-      if (name === "fits") fitsTab.draw();
-      else scanTab.draw();
+    return z;
+  }
+
+  /**
+   * Show the model at the address `base`, and its fits, in `root`; return {dispose(), place()}.
+   * options: {place, onplace(), onready()}.
+   */
+  Viewer.openModel = function (root, base, options) {
+    const $ = (id) => root.getElementById(id);
+    const wanted = options.place || {};
+    /** The state that the tabs share; `begin` fills in what the server sends. */
+    const page = {
+      $, base, show, apply,
+      onplace: () => { if (page.stage) options.onplace?.(); },
+      about: null, // facts of the model
+      model: null,
+      share: null, // of the variance, of each mode
+      z: null, // all coefficients of the shape in Model, standard deviations
+      stage: null,
+      shown: "model", // name of the tab
+      shapes: new Map(), // those to compare: key -> {name, z}
+      fits: [], // rows of the saved fits
+      fitView: null, // the fit that is drawn in Fits
+    };
+    page.modelTab = Viewer.makeModelTab(page);
+    page.compareTab = Viewer.makeCompareTab(page);
+    page.fitsTab = Viewer.makeFitsTab(page);
+    const { modelTab, compareTab, fitsTab } = page;
+    let isChosen = Boolean(wanted.tab); // whether the user chose a tab before the fits were there
+    let disposed = false;
+
+    /** Show a tab; return when it is drawn. */
+    function show(name) {
+      let drawn = null;
+      page.shown = name;
+      modelTab.stop();
+      compareTab.stop();
+      for (const tab of TABS) {
+        $(`tab-${tab}`).setAttribute("aria-selected", String(tab === name));
+        $(`tab-${tab}`).tabIndex = tab === name ? 0 : -1;
+        $(tab).hidden = tab !== name;
+      }
+      page.fitView.stop();
+      page.fitView.active = name === "fits";
+      if (name === "model") modelTab.draw();
+      else if (name === "compare") compareTab.draw(true);
+      else {
+        page.stage.clear();
+        page.stage.split(false);
+        drawn = fitsTab.draw();
+      }
+      if (name !== "fits") page.stage.a.frame(["model"]);
+      page.onplace();
+      return drawn;
     }
-    if (name === "model" || name === "compare") page.stage.a.frame(["model"]);
-  }
 
-  function apply(values) {
-    modelTab.setShape(values);
-    show("model");
-    if (innerWidth <= 760) scrollTo({ top: 0 });
-  }
-
-  function startTabs() {
-    for (const tab of TABS) {
-      $(`tab-${tab}`).addEventListener("click", () => { isChosen = true; show(tab); });
-      $(`tab-${tab}`).addEventListener("keydown", (event) => {
-        const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
-        if (!step) return;
-        const next = TABS[(TABS.indexOf(tab) + step + TABS.length) % TABS.length];
-        show(next);
-        $(`tab-${next}`).focus();
-      });
+    function apply(values) {
+      modelTab.setShape(values);
+      show("model");
     }
-    Viewer.startTheme(() => { for (const view of [page.stage.a, page.stage.b]) if (view) view.request(); });
-    $("view-home").addEventListener("click", () => page.stage.a.reset());
-    $("picture").addEventListener("click", guarded(async () => save(await page.stage.picture(), "shapespace.png")));
-  }
 
-  function ready() {
-    window.shapespaceReady = true;
-    document.body.dataset.ready = "true";
-  }
+    function startTabs() {
+      for (const tab of TABS) {
+        $(`tab-${tab}`).addEventListener("click", () => { isChosen = true; show(tab); });
+        $(`tab-${tab}`).addEventListener("keydown", (event) => {
+          const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
+          if (!step) return;
+          const tabs = TABS.filter((name) => !$(`tab-${name}`).hidden);
+          const next = tabs[(tabs.indexOf(tab) + step + tabs.length) % tabs.length];
+          show(next);
+          $(`tab-${next}`).focus();
+        });
+      }
+      $("view-home").addEventListener("click", () => page.stage.a.reset());
+      $("picture").addEventListener("click", guarded(async () => save(await page.stage.picture(), "shapespace.png")));
+    }
 
-  async function begin() {
-    const about = await json("api/about");
-    const unpacked = await binary("api/model");
-    const model = new Shapespace.Model(unpacked), stage = new Viewer.Stage();
-    Object.assign(page, { about, model, stage, share: unpacked.arrays.share, z: new Float64Array(about.modes) });
-    document.title = `${about.model} \u2013 shapespace`;
-    $("about").textContent = `${about.model}: ${about.vertices.toLocaleString("en")} vertices, ${about.modes} ${about.modes === 1 ? "mode" : "modes"}`;
-    const context = { stage, model, about, apply, download: modelTab.download, alert: alertUser };
-    page.fitView = new Viewer.FitView($("fit-detail"), context, "fit");
-    page.scanView = new Viewer.FitView($("scan-detail"), context, "scan");
-    stage.a.on("click", landmarks.placeAt);
-    stage.a.on("draw", ready);
-    window.shapespaceStage = stage;
-    modelTab.start();
-    compareTab.start();
-    startTabs();
-    Viewer.startMessages();
-    modelTab.draw();
-    stage.a.frame(["model"]);
-    $("loading").hidden = true;
-    if (!stage.a.works) ready();
-    await fitsTab.start();
-    if (about.has_fits && !isChosen) show("fits");
-    await uploads.start();
-  }
+    async function begin() {
+      const about = await Viewer.json(`${base}api/about`);
+      const unpacked = await Viewer.binary(`${base}api/model`);
+      if (disposed) return;
+      const model = new Shapespace.Model(unpacked);
+      Object.assign(page, { about, model, share: unpacked.arrays.share, z: coefficientsOf(wanted.z, about.modes) });
+      page.stage = new Viewer.Stage(page);
+      $("about").textContent = `${about.model}: ${about.vertices.toLocaleString("en")} vertices, ${about.modes} ${about.modes === 1 ? "mode" : "modes"}`;
+      page.fitView = new Viewer.FitView($("fit-detail"), { stage: page.stage, model, about, apply, download: modelTab.download });
+      page.stage.a.on("draw", ready);
+      window.shapespaceStage = page.stage;
+      modelTab.start();
+      compareTab.start();
+      startTabs();
+      modelTab.draw();
+      page.stage.a.frame(["model"]);
+      $("loading").hidden = true;
+      if (!page.stage.a.works) ready();
+      await fitsTab.start(wanted.fit);
+      if (disposed) return;
+      const tab = TABS.includes(wanted.tab) && !$(`tab-${wanted.tab}`).hidden ? wanted.tab : about.has_fits && !isChosen ? "fits" : page.shown;
+      if (tab !== page.shown) await show(tab);
+      if (disposed) return;
+      Viewer.setCamera(page.stage.a, wanted.camera);
+      page.stage.a.on("camera", page.onplace);
+    }
 
-  Object.assign(Viewer, { show, apply });
-  guarded(begin)();
+    let isReady = false;
+    function ready() {
+      if (isReady) return;
+      isReady = true;
+      options.onready?.();
+    }
+
+    guarded(begin)();
+    return {
+      dispose() {
+        disposed = true;
+        modelTab.stop();
+        compareTab.stop();
+        if (!page.stage) return;
+        page.fitView.stop();
+        page.stage.dispose();
+      },
+      place: () => (page.stage ? { tab: page.shown, z: textOf(page.z), fit: page.shown === "fits" ? fitsTab.name() || "" : "", camera: Viewer.cameraOf(page.stage.a) } : wanted),
+    };
+  };
 })();

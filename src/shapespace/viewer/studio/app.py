@@ -63,7 +63,7 @@ from shapespace.viewer.studio.project import (
     with_cells,
 )
 from shapespace.viewer.studio.specimen_checks import SpecimenChecks
-from shapespace.viewer.studio.views import REPORT_PAGE, Views, result_path, view_kinds
+from shapespace.viewer.studio.views import Views, result_path, view_kinds
 
 _TABLE_BYTES, _REQUEST_BYTES = 2**24, 2**20
 _EVENT_S = 0.4  # between events
@@ -78,14 +78,13 @@ class OpenProject:
         forms: forms of the commands.
         create: whether to create the project.
         changed: function that is called after each change.
-        upload_bytes: size limit of a scan.
         labels: labels of options in the messages of commands.
         read_only: whether nothing is written into the folder, in which a studio may run.
     """
 
     def __init__(
-        self, folder: Path, forms: Forms, *, create: bool, changed: Callable[[], None], upload_bytes: int,
-        labels: OptionLabels, read_only: bool = False,
+        self, folder: Path, forms: Forms, *, create: bool, changed: Callable[[], None], labels: OptionLabels,
+        read_only: bool = False,
     ) -> None:  # fmt: skip
         self.project = Project.open(folder, create=create)
         self._resources = ExitStack()
@@ -93,7 +92,7 @@ class OpenProject:
             self._resources.enter_context(only_writer(self.project.folder))
         self.jobs = Jobs(self.project.folder, changed, read_only=read_only)
         self.checks = SpecimenChecks(self.project.folder, changed, self.project.exclude, read_only=read_only)
-        self.views = Views(self._result, upload_bytes, labels)
+        self.views = Views(self._result, labels)
         self._sentence = labels.sentence
         self._forms = forms
         self._outdated: tuple[object, dict[int, Outdated]] = (None, {})
@@ -138,14 +137,12 @@ class OpenProject:
         left_s = None if progress is None else progress.pop("left_s")
         path = self._result(job.number)
         kinds = [] if path is None else view_kinds(path)
-        page = f"/view/{job.number}/"
-        pages = [page, *(f"{page}{REPORT_PAGE}/" for _ in kinds[1:])]
         sentences, methods = ([], None) if path is None else _words(path)
         return {
             "number": job.number, "kind": job.kind, "command": job.command, "status": job.status,
             "message": self._sentence(job.message), "progress": progress, "seconds": self.jobs.running_for(job),
             "left_s": left_s, "output": job.output, "options": job.options, "on": job.on,
-            "views": [{"kind": kind, "href": href} for kind, href in zip(kinds, pages, strict=False)],
+            "views": [{"kind": kind, "href": f"/view/{job.number}/{kind}/"} for kind in kinds],
             "sentences": list(map(self._sentence, sentences)), "methods": methods and self._sentence(methods),
             "outdated": self._outdated[1].get(job.number),
             # A command that rejected its input would reject it again.
@@ -198,7 +195,7 @@ class Studio:
         """Return the application, without a guard."""
         job = "/api/jobs/{number:int}"
         routes = [
-            route("/", lambda _: html_page("studio")),
+            route("/", lambda _: html_page()),
             Route("/assets/{name}", asset),
             Route("/api/project", self._state),
             Route("/api/events", self._events),
@@ -255,8 +252,8 @@ class Studio:
             if self._open is not None and self._open.project.folder == folder.resolve():
                 return
             opened = OpenProject(
-                folder, self._forms, create=create, changed=self._changed, upload_bytes=self._upload_bytes,
-                labels=self._labels, read_only=self._read_only,
+                folder, self._forms, create=create, changed=self._changed, labels=self._labels,
+                read_only=self._read_only,
             )  # fmt: skip
             self.close()
             self._open = opened
@@ -510,4 +507,4 @@ def make_studio(studio: Studio, access: Access, *, loopback: bool = True, cookie
         loopback: whether only this machine can reach the server.
         cookie_name: browsers share cookies between ports, so the name should contain the port.
     """
-    return Guard(studio.app(), access=access, cookie_name=cookie_name, loopback=loopback, frames=True)
+    return Guard(studio.app(), access=access, cookie_name=cookie_name, loopback=loopback)

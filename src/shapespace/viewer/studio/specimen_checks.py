@@ -7,6 +7,7 @@ import hashlib
 import json
 import multiprocessing
 import os
+import sys
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from pathlib import Path
@@ -24,7 +25,6 @@ from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.report.render.scene import decimate, pack
 from shapespace.report.render.thumbnails import mesh_still
 from shapespace.types import Mesh
-from shapespace.viewer.fitting import lower_priority
 
 _FOLDER = "checks"
 _MOST_PROCESSES = 4
@@ -120,7 +120,12 @@ class SpecimenChecks:
 
 def _start_process() -> None:
     """Prefer the server, and end with it also when it is killed; a process of a pool would wait for its queue."""
-    lower_priority()
+    if sys.platform != "win32":
+        os.nice(5)
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError):
+            # The server survives when memory runs out.
+            Path("/proc/self/oom_score_adj").write_text("1000")
     if (server := multiprocessing.parent_process()) is not None:
         end_after(server.join)
 

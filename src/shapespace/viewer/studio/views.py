@@ -1,96 +1,114 @@
-"""The pages of results in the studio: those of the viewer, and the reports of analyses, under `/view/NUMBER/`."""
+"""The views of results: surfaces in correspondence, models with their fits, and reports; each is an application."""
 
 from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from typing import Literal
 
 import anyio.to_thread
 from starlette._utils import get_route_path
 from starlette.datastructures import MutableHeaders
-from starlette.responses import HTMLResponse
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, Response
+from starlette.routing import Mount, Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.schemas import CorrespondenceRecord
+from shapespace.store.manifest import Manifest
+from shapespace.version import __version__
 from shapespace.viewer.corresponding_surfaces import Surfaces
 from shapespace.viewer.guard import refusal
 from shapespace.viewer.model_view import ModelView
-from shapespace.viewer.server import model_app, surfaces_app
+from shapespace.viewer.server import application, asset, html_page, json_response, model_app, route, surfaces_app
 from shapespace.viewer.studio.job_commands import OptionLabels
-from shapespace.viewer.uploaded_scans import FOLDER_PREFIX, Scans, UploadLimits
 
-REPORT, REPORT_PAGE = "report.html", "report"
-_MOST_OPEN = 6  # pages whose data are in memory at a time
+ViewKind = Literal["surfaces", "model", "report"]
+
+REPORT = "report.html"
+_MOST_OPEN = 6  # views whose data are in memory at a time
 REPORT_HEADERS = {
-    # A report is a page of its own: its scripts run, but cannot reach the studio.
+    # In a tab of its own, the scripts of a report run, but cannot reach the page that links to it.
     "Content-Security-Policy": (
         "sandbox allow-scripts allow-downloads allow-popups; default-src 'none'; script-src 'unsafe-inline' blob:; "
-        "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; frame-ancestors 'self'"
+        "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; frame-ancestors 'none'"
     ),
 }
 
 
-def view_kinds(path: Path) -> list[str]:
-    """Return which pages show a result: `surfaces`, `model`, `report`; the first one is that of `/view/NUMBER/`."""
+def view_kinds(path: Path) -> list[ViewKind]:
+    """Return which views a result has, the main one first; none if nothing of it can be shown."""
     if path.is_file():
-        return ["report"] if path.name == REPORT else ["model"] if path.suffix == ".h5" else []
-    kinds: list[str] = []
+        return ["report"] if path.suffix == ".html" else ["model"] if path.suffix == ".h5" else []
+    kinds: list[ViewKind] = []
     if (path / CorrespondenceRecord.FILE).is_file():
         kinds.append("surfaces")
-    elif next(path.glob("*.fit.json"), None) is not None:
+    elif (path / Manifest.FILE).is_file() or next(path.glob("*.fit.json"), None) is not None:
         kinds.append("model")
     return [*kinds, "report"] if (path / REPORT).is_file() else kinds
 
 
+def open_view(kind: ViewKind, path: Path, labels: OptionLabels | None = None, model: Path | None = None) -> ASGIApp:
+    """Return the application of a view.
+
+    Args:
+        kind: kind of the view.
+        path: the result.
+        labels: labels that replace the names of options in a report, or None.
+        model: model of the fits in the folder (default: the one that their records name).
+
+    Raises:
+        ShapespaceError: the result cannot be read.
+    """
+    if kind == "surfaces":
+        return surfaces_app(Surfaces(path))
+    if kind == "model":
+        return model_app(ModelView.open(path, model))
+    file = path / REPORT if path.is_dir() else path
+
+    def report(request: Request) -> Response:
+        page = file.read_text(encoding="utf-8")
+        return HTMLResponse(page if labels is None else labels.page(page), headers=REPORT_HEADERS)
+
+    return application([Route("/", report)], str)
+
+
 class Views:
-    """ASGI application of the pages of results, opened when they are first asked for.
+    """ASGI application of the views of jobs' results, `/NUMBER/KIND/...`; each is opened when it is first asked for.
 
     Args:
         result: function that returns the path of the result of a job; None if it has none.
-        upload_bytes: size limit of scans that are dropped onto a model's page.
         labels: labels of options in the messages of commands.
     """
 
-    def __init__(self, result: Callable[[int], Path | None], upload_bytes: int, labels: OptionLabels) -> None:
+    def __init__(self, result: Callable[[int], Path | None], labels: OptionLabels) -> None:
         self._result = result
         self._labels = labels
-        self._upload_bytes = upload_bytes
-        self._open: OrderedDict[tuple[Path, int], tuple[ASGIApp, ExitStack]] = OrderedDict()
+        self._open: OrderedDict[tuple[ViewKind, Path, int], ASGIApp] = OrderedDict()
         self._lock = threading.Lock()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer one request of a page."""
-        number, _, rest = get_route_path(scope).lstrip("/").partition("/")
+        """Answer one request of a view."""
+        number, kind, *_ = [*get_route_path(scope).lstrip("/").split("/"), ""]
         path = self._result(int(number)) if number.isdigit() and len(number) < 8 else None
-        kinds = [] if path is None else view_kinds(path)
-        if path is None or not kinds:
-            await refusal(404, "There is no page of this result; reload the studio.")(scope, receive, send)
-        elif "report" in kinds and (kinds[0] == "report" or rest == f"{REPORT_PAGE}/"):
-            file = path if path.name == REPORT else path / REPORT
-            page = await anyio.to_thread.run_sync(lambda: self._labels.page(file.read_text(encoding="utf-8")))
-            await HTMLResponse(page, headers=REPORT_HEADERS)(scope, receive, send)
-        else:
-            try:
-                app = await anyio.to_thread.run_sync(self._app, path)
-            except ShapespaceError as error:
-                await refusal(422, str(error))(scope, receive, send)
-                return
-            inner = dict(scope, root_path=f"{scope.get('root_path', '')}/{number}")
-            if not rest:
-                # Of the page itself, whose addresses are relative to the folder.
-                inner["path"] = f"{inner['root_path']}/"
-            await app(inner, receive, self._with_labels(send))
+        known: list[ViewKind] = [] if path is None else [one for one in view_kinds(path) if one == kind]
+        if path is None or not known:
+            await refusal(404, "There is no view of this result; reload the studio.")(scope, receive, send)
+            return
+        try:
+            app = await anyio.to_thread.run_sync(lambda: self._app(known[0], path))
+        except ShapespaceError as error:
+            await refusal(422, self._labels.sentence(str(error)))(scope, receive, send)
+            return
+        inner = dict(scope, root_path=f"{scope.get('root_path', '')}/{number}/{kind}")
+        await app(inner, receive, self._with_labels(send))
 
     def close(self) -> None:
-        """Close all pages."""
+        """Close all views."""
         with self._lock:
-            for _, stack in self._open.values():
-                stack.close()
             self._open.clear()
 
     def _with_labels(self, send: Send) -> Send:
@@ -115,26 +133,43 @@ class Views:
 
         return send_message
 
-    def _app(self, path: Path) -> ASGIApp:
+    def _app(self, kind: ViewKind, path: Path) -> ASGIApp:
         record = path / CorrespondenceRecord.FILE
-        key = (path, (record if record.is_file() else path).stat().st_mtime_ns)
+        key = (kind, path, (record if record.is_file() else path).stat().st_mtime_ns)
         with self._lock:
             if key not in self._open:
-                stack = ExitStack()
-                self._open[key] = (self._make_app(path, stack), stack)
+                self._open[key] = open_view(kind, path, self._labels)
             self._open.move_to_end(key)
             while len(self._open) > _MOST_OPEN:
-                self._open.popitem(last=False)[1][1].close()
-            return self._open[key][0]
+                self._open.popitem(last=False)
+            return self._open[key]
 
-    def _make_app(self, path: Path, stack: ExitStack) -> ASGIApp:
-        if (path / CorrespondenceRecord.FILE).is_file():
-            return surfaces_app(Surfaces(path))
-        view = ModelView.open(path)
-        root = Path(stack.enter_context(TemporaryDirectory(prefix=FOLDER_PREFIX, ignore_cleanup_errors=True)))
-        scans = Scans(root, view.model, view.model_name, UploadLimits(upload_bytes=self._upload_bytes))
-        stack.callback(scans.close)
-        return model_app(view, scans)
+
+def single_result_app(name: str, views: Mapping[ViewKind, ASGIApp]) -> ASGIApp:
+    """Return the application of the page that only shows one result.
+
+    Args:
+        name: name of the result on the page.
+        views: the views of the result, the main one first.
+    """
+    hrefs = [{"kind": kind, "href": f"/view/{kind}/"} for kind in views]
+    result = {"number": 1, "output": name, "views": hrefs, "sentences": []}
+    state: dict[str, object] = {
+        "version": __version__,
+        "project": None,
+        "result": result,
+        "recent": [],
+        "read_only": True,
+    }
+    return application(
+        [
+            route("/", lambda _: html_page()),
+            Route("/assets/{name}", asset),
+            route("/api/project", lambda _: json_response(state)),
+            *(Mount(f"/view/{kind}", app=app) for kind, app in views.items()),
+        ],
+        str,
+    )
 
 
 def result_path(folder: Path, output: str) -> Path:
