@@ -2,7 +2,7 @@
 (function () {
   "use strict";
 
-  const { html, useState, useEffect, useRef } = window.Preact;
+  const { html, useState, useEffect, useRef, useMemo } = window.Preact;
   const Studio = window.ShapespaceStudio;
   const T = window.ShapespaceTexts;
   const J = T.jobs;

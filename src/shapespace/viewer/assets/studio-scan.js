@@ -8,15 +8,8 @@
   const S = window.ShapespaceTexts.specimens;
   const { Button, Dialog } = Studio;
   const BORDER = [0.85, 0.1, 0.1];
-  const SCRIPTS = ["three.min", ...["data", "camera", "material", "surfaces", "drawing", "controls", "view", "colours"].map((part) => `scene-${part}`)];
   // Yaw and pitch, radians.
   const SIDES = { front: [0, 0], back: [Math.PI, 0], left: [-Math.PI / 2, 0], right: [Math.PI / 2, 0], top: [0, Math.PI / 2], bottom: [0, -Math.PI / 2] };
-
-  /** Load what draws in 3-D, once it is needed. */
-  let loading = null;
-  const load = () => (loading ||= SCRIPTS.reduce((before, name) => before.then(() => new Promise((resolve, reject) => {
-    document.head.append(Object.assign(document.createElement("script"), { src: `/assets/${name}.js`, onload: resolve, onerror: () => reject(new Error(S.scan.failed)) }));
-  })), Promise.resolve()));
 
   /** The longest length of 1, 2 or 5 times a power of 10 that is at most `most`. */
   function nice(most) {
@@ -40,7 +33,7 @@
     useEffect(() => {
       let ended = false;
       const show = async () => {
-        await load();
+        await Viewer.load("scene");
         const { arrays } = window.Shapespace.unpack(await (await Studio.ask(`/api/scans/${encodeURIComponent(specimen.id)}`)).arrayBuffer());
         if (ended) return;
         const made = new window.Shapespace.View(box.current, { label: S.scan.label(specimen.id), embedded: false });
