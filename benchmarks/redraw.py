@@ -38,7 +38,7 @@ SCRIPT = """async ([repeat, map]) => {
   if (box.checked !== map) box.click();
   const view = window.shapespaceStage.a;
   const move = (k, value) => {
-    const slider = document.getElementById(`mode-${k + 1}`);
+    const slider = document.querySelector('[data-testid=pane]').shadowRoot.getElementById(`mode-${k + 1}`);
     slider.value = value;
     slider.dispatchEvent(new Event("input", { bubbles: true }));
   };
@@ -102,7 +102,7 @@ def measure(repeat: int) -> dict[str, object]:
             sent = []
             for _ in range(5):
                 start = time.perf_counter()
-                size = len(visitor.open(page_at + "api/model").read())
+                size = len(visitor.open(page_at + "view/model/api/model").read())
                 sent.append(1000 * (time.perf_counter() - start))
             with sync_playwright() as playwright:
                 browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)

@@ -99,7 +99,7 @@ def memory_mb(pid: int) -> float:
 
 
 def until(page: object, expression: str, seconds: float = 300.0) -> float:
-    """Wait until `expression` is true on a page or frame; return the seconds."""
+    """Wait until `expression` is true on a page; return the seconds."""
     began = time.monotonic()
     while not page.evaluate(expression):
         if time.monotonic() - began > seconds:
@@ -141,17 +141,14 @@ def measure(folder: Path) -> None:
         print(f"first picture of a specimen: {time.monotonic() - began:.1f} s")
         began = time.monotonic()
         page.evaluate("document.querySelector('[data-testid=tab-correspondence]').click()")
-        while not (frames := [one for one in page.frames if "/view/" in one.url]):
-            page.wait_for_timeout(20)
-        frame = frames[0]
-        until(frame, "!!(window.shapespaceCells && window.shapespaceCells[0].positions)")
+        until(page, "!!(window.shapespaceCells && window.shapespaceCells[0].positions)")
         print(f"first surface in correspondence: {time.monotonic() - began:.1f} s")
-        until(frame, "window.shapespaceReady === true")
+        until(page, "document.querySelector('[data-testid=pane]').dataset.ready === 'true'")
         print(f"all on the page: {time.monotonic() - began:.1f} s")
         time.sleep(2.0)
-        times = frame.evaluate(f"({TURN})()")
+        times = page.evaluate(f"({TURN})()")
         print(f"frames a second while 12 turn: {1000 * (len(times) - 6) / (times[-1] - times[5]):.1f}")
-        heap = frame.evaluate("performance.memory.usedJSHeapSize / 2 ** 20")
+        heap = page.evaluate("performance.memory.usedJSHeapSize / 2 ** 20")
         browser_mb = memory_mb(os.getpid()) - memory_mb(server.pid) - own_mb()
         print(f"page: JavaScript heap {heap:.0f} MB, all processes of the browser {browser_mb:.0f} MB")
         print(f"server and its processes: {memory_mb(server.pid):.0f} MB")

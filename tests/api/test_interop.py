@@ -322,12 +322,12 @@ def test_the_viewer_in_a_cell_lets_notebooks_of_this_machine_in_and_nobody_else(
             assert page.status_code == 200 and "x-frame-options" not in page.headers
             assert "frame-ancestors http://localhost:* http://127.0.0.1:*" in page.headers["content-security-policy"]
             [fit] = cellmate.get(
-                "/api/fits", headers={"Sec-Fetch-Dest": "empty", "Sec-Fetch-Site": "same-origin"}
+                "/view/model/api/fits", headers={"Sec-Fetch-Dest": "empty", "Sec-Fetch-Site": "same-origin"}
             ).json()
             assert fit["pictured"] and fit["status"] == result.status
-            assert cellmate.get("/api/fits", headers={"Sec-Fetch-Dest": "script"}).status_code == 403
+            assert cellmate.get("/view/model/api/fits", headers={"Sec-Fetch-Dest": "script"}).status_code == 403
         with httpx.Client(base_url=base) as stranger:
-            assert stranger.get("/api/fits").status_code == 401
+            assert stranger.get("/view/model/api/fits").status_code == 401
             assert stranger.get("/", params={"token": ticket}).status_code == 401
     finally:
         view.close()

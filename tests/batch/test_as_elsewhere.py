@@ -23,7 +23,7 @@ POSIX_ONLY = {
     ("datasets/fetch.py", "fcntl"): "elsewhere msvcrt",
     ("io/sandbox_child.py", "resource"): "elsewhere its parent ends it when it is late",
     ("io/files.py", "kill"): "on Windows nothing is asked, and files are left for an hour",
-    ("viewer/fitting.py", "nice"): "elsewhere the process keeps its place",
+    ("viewer/studio/specimen_checks.py", "nice"): "elsewhere the process keeps its place",
 }
 """Each use of what Windows lacks, with what happens there."""
 MODULES = {"fcntl", "grp", "pty", "pwd", "resource", "syslog", "termios", "tty"}

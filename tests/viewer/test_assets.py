@@ -6,19 +6,18 @@ from importlib.resources import files
 
 import pytest
 
-from shapespace.viewer.server import ASSETS, PAGES
+from shapespace.viewer.server import ASSETS, PAGES, SCENE
 
 
-@pytest.mark.parametrize("page", ["viewer.html", "surfaces.html", "studio.html"])
-def test_a_page_asks_only_for_files_that_are_served(page: str) -> None:
-    wanted = re.findall(r'(?:src|href)="/assets/([^"]+)"', (PAGES / page).read_text("utf-8"))
-    assert wanted and set(wanted) <= set(ASSETS)
-
-
-def test_every_served_file_exists_and_is_asked_for() -> None:
-    pages = "".join(path.read_text("utf-8") for path in PAGES.glob("*.html"))
-    for name, (path, _) in ASSETS.items():
-        assert path.is_file() and f'"/assets/{name}"' in pages, name
+def test_the_page_asks_only_for_files_that_are_served_and_for_each_of_them() -> None:
+    page, pane = ((PAGES / name).read_text("utf-8") for name in ("studio.html", "studio-pane.js"))
+    asked = set(re.findall(r'(?:src|href)="/assets/([^"]+)"', page))
+    lists = re.findall(r"const (SCRIPTS|STYLES) = \{(.*?)\};", pane, re.DOTALL)
+    endings = {"SCRIPTS": "js", "STYLES": "css"}
+    later = {f"{name}.{endings[kind]}" for kind, names in lists for name in re.findall(r'"([^"]+)"', names)}
+    assert asked and len(lists) == 2
+    assert asked | later == {*ASSETS, SCENE}
+    assert all(path.is_file() for path in ASSETS.values())
 
 
 @pytest.mark.parametrize("name", ["preact-htm.min.js", "uPlot.iife.min.js", "uPlot.min.css"])

@@ -1,30 +1,11 @@
 """The viewer's server: what it sends, what it refuses and how, and what it leaves behind."""
 
 import json
-import os
-import time
-from collections.abc import Iterator
-from multiprocessing.connection import Connection
 from pathlib import Path
 
-import httpx
 import numpy as np
 import pytest
-from viewer_world import (
-    Start,
-    agrees,
-    model,
-    progress,
-    running,
-    scan_file,
-    sentence,
-    start,
-    unpacked,
-    until,
-    upload,
-    wait_for_events,
-    waits,
-)
+from viewer_world import Start, model, scan_file, sentence, start, unpacked
 
 from shapespace.batch.fit_work import FitJob, fit_file
 from shapespace.errors import InputError, ShapespaceError
@@ -32,180 +13,17 @@ from shapespace.fit.fit_scan import FitConfig
 from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.io.meshes.ply import read_ply
 from shapespace.model.shape_model import ShapeModel
-from shapespace.viewer.fitting import Upload, fit_upload
 from shapespace.viewer.model_view import ModelView, without_folders
 from shapespace.viewer.serve import listen, page_address, serve
-from shapespace.viewer.uploaded_scans import UploadLimits
 
 __all__ = ["model", "scan_file", "start"]
 
 
-def dies(pipe: Connection, upload: Upload) -> None:
-    os.abort()
-
-
-def test_a_dropped_scan_is_fitted_as_the_command_line_does(
-    start: Start, model: ShapeModel, scan_file: Path, tmp_path: Path
-) -> None:
-    viewer = start()
-    user = viewer.user()
-    answer = upload(user, scan_file.read_bytes(), scan_file.name)
-    assert answer.status_code == 201
-    key = answer.json()["id"]
-    events = wait_for_events(user, key)
-    kinds = [event["event"] for event in events[:-1]]
-    assert kinds[0] == "scan" and kinds[-1] == "verdict"
-    assert set(kinds[1:-1]) == {"state"} and len(kinds) > 8
-    later = user.get(f"/api/scans/{key}/progress", params={"after": len(kinds) - 1}).json()
-    assert later["state"] == "done" and [event["event"] for event in later["events"]] == ["verdict"]
-    verdict = events[-2]
-    assert verdict["status"] == "converged" and verdict["pictured"]
-    assert 0 < verdict["shown"]["model_to_scan"]["mean"] < 1 and verdict["shown"]["model_seen_share"] > 0.9
-
-    fit_file(FitJob("cli", scan_file), model, Path("blobs.h5"), tmp_path, FitConfig(), stages=True)
-    expected = json.loads((tmp_path / "cli.fit.json").read_text())
-    record = user.get(f"/api/scans/{key}/record").json()
-    for one in (record, expected):
-        del one["seconds"]
-        del one["scan"]["size_bytes"], one["scan"]["modified_ns"]
-        # The viewer leaves out the paths of its own folders.
-        one["scan"].pop("path", None), one["model"].pop("path", None)
-    assert record == expected
-    assert verdict["b"] == record["b"] == events[-3]["b"]
-
-    for part in ("preview", "picture"):
-        assert len(user.get(f"/api/scans/{key}/{part}").content) > 10_000
-    # What was uploaded is gone, what came of it is not.
-    assert not list(viewer.root.rglob("upload-*")) and list(viewer.root.rglob("*.fitted.ply"))
-
-
-def test_a_dropped_scan_of_a_format_only_read_is_taken_densely(start: Start, scan_file: Path) -> None:
-    scan = read_mesh(scan_file)
-    assert scan.faces is not None
-    points = ", ".join(" ".join(f"{x:.6f}" for x in point) for point in scan.vertices)
-    faces = ", ".join(f"{a}, {b}, {c}, -1" for a, b, c in scan.faces)
-    text = (
-        f"#VRML V2.0 utf8\nShape {{ geometry IndexedFaceSet {{ coord Coordinate {{ point [ {points} ] }} "
-        f"coordIndex [ {faces} ] }} }}\n"
-    )
-    user = start().user()
-    assert ".wrl" in user.get("/api/about").json()["formats"]
-    answer = user.put("/api/scans?name=face.wrl&dense=1", content=text.encode())
-    assert answer.status_code == 201 and answer.json()["dense"]
-    key = answer.json()["id"]
-    assert wait_for_events(user, key)[-2]["pictured"]
-    record = user.get(f"/api/scans/{key}/record").json()
-    assert record["config"]["dense"] and "dense" in record["distances_mm"]
-    final, dense = (
-        user.post("/api/export?format=ply", json={"scan": key, "stage": stage}).content for stage in ("final", "dense")
-    )
-    assert len(final) > 1000 and len(dense) > 1000 and final != dense
-
-
-def test_a_crash_in_a_fit_leaves_the_server_up_and_is_one_sentence(start: Start) -> None:
-    viewer = start(worker=dies)
-    user = viewer.user()
-    events = wait_for_events(user, upload(user, b"anything").json()["id"])
-    assert events[-2]["status"] == "failed" and "memory" in events[-2]["reason"]
-    assert user.get("/api/about").status_code == 200 and not list(viewer.root.rglob("upload-*"))
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "says"),
-    [
-        ("empty.ply", b"", "empty.ply: it is empty"),
-        ("broken.ply", b"ply\nformat ascii 1.0\nelement vertex 5\n", "broken.ply"),
-        ("one.obj", b"v 0 0 0\n", "one.obj"),
-        ("../../../etc/passwd.stl", b"solid\n", "passwd.stl"),
-    ],
-)
-def test_a_broken_file_is_one_sentence_that_names_it(start: Start, name: str, content: bytes, says: str) -> None:
-    viewer = start()
-    user = viewer.user()
-    events = wait_for_events(user, upload(user, content, name).json()["id"])
-    assert events[-2]["event"] == "verdict" and events[-1]["state"] == "done"
-    reason = events[-2]["reason"]
-    assert events[-2]["status"] == "failed" and says in reason and reason.endswith(".")
-    assert str(viewer.root) not in reason and "upload-" not in reason
-    assert not list(viewer.root.rglob("upload-*"))
-
-
-def test_scans_that_are_too_large_or_of_another_kind_are_refused(start: Start) -> None:
-    viewer = start(worker=agrees, upload_bytes=1000)
-    user = viewer.user()
-    assert upload(user, b"x" * 1000).status_code == 201
-    announced = upload(user, b"x" * 1001)
-    assert announced.status_code == 413 and "larger than" in sentence(announced)
-
-    def slowly() -> Iterator[bytes]:
-        for _ in range(2):
-            yield b"x" * 600
-            time.sleep(0.2)
-
-    grown = user.put("/api/scans?name=a.ply", content=slowly())
-    assert grown.status_code == 413 and "larger than" in sentence(grown)
-    for name in ("a.exe", "a", "", "a.ply.html"):
-        other = upload(user, b"x", name)
-        assert other.status_code == 415 and ".ply" in sentence(other)
-    assert len([path for path in viewer.root.iterdir() if path.is_dir()]) == 1
-
-
 def test_a_body_larger_than_announced_or_without_a_size_is_bounded(start: Start) -> None:
-    user = start(request_bytes=1000).user()
-    for content in (b" " * 2000, iter([b" " * 600] * 2)):
-        refused = user.post("/api/export?format=ply", content=content)
+    user = start().user()
+    for content in (b" " * 2**21, iter([b" " * 2**19] * 3)):
+        refused = user.post("/view/model/api/export?format=ply", content=content)
         assert refused.status_code == 413 and "too long" in sentence(refused)
-
-
-def test_the_queue_is_bounded_and_a_fit_can_be_stopped(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shapespace.viewer.uploaded_scans.cores", lambda: 1)
-    viewer = start(worker=waits, unfinished=2)
-    user = viewer.user()
-    first, second = (upload(user, b"x").json()["id"] for _ in range(2))
-    full = upload(user, b"x")
-    assert full.status_code == 429 and "2 scans" in sentence(full)
-    until(lambda: progress(user, first)["state"] == "fitting")
-    assert progress(user, second)["state"] == "waiting" and progress(user, second)["position"] == 1
-    assert user.post(f"/api/scans/{first}/cancel").status_code == 200
-    assert "stopped" in wait_for_events(user, first)[-2]["reason"]
-    until(lambda: progress(user, second)["state"] == "fitting")
-    assert user.delete(f"/api/scans/{second}").status_code == 200
-    until(lambda: not (viewer.root / second).exists())
-    assert user.get(f"/api/scans/{second}/progress").status_code == 404
-
-
-def test_the_oldest_fitted_scan_is_removed_and_a_waiting_one_at_once(
-    start: Start, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("shapespace.viewer.uploaded_scans.cores", lambda: 1)
-    viewer = start(worker=agrees, max_fits=2)
-    user = viewer.user()
-    keys = []
-    for _ in range(3):
-        keys.append(upload(user, b"x").json()["id"])
-        wait_for_events(user, keys[-1])
-    assert [scan["id"] for scan in user.get("/api/scans").json()] == keys[1:]
-    assert not (viewer.root / keys[0]).exists()
-    slow = start(worker=waits)
-    user = slow.user()
-    first, waiting = (upload(user, b"x").json()["id"] for _ in range(2))
-    assert user.delete(f"/api/scans/{waiting}").status_code == 200
-    assert not (slow.root / waiting).exists() and (slow.root / first).exists()
-
-
-def test_a_fit_that_takes_too_long_is_stopped(start: Start) -> None:
-    user = start(worker=waits, fit_s=0.2).user()
-    assert "longer than" in wait_for_events(user, upload(user, b"x").json()["id"])[-2]["reason"]
-
-
-def test_nothing_is_left_when_the_server_ends(model: ShapeModel) -> None:
-    with running(ModelView(model, "m.h5"), UploadLimits(), waits) as viewer:
-        user = viewer.user()
-        key = upload(user, b"x").json()["id"]
-        assert oct(viewer.root.stat().st_mode)[-3:] == oct((viewer.root / key).stat().st_mode)[-3:] == "700"
-        until(lambda: progress(user, key)["state"] == "fitting")
-        began = time.monotonic()
-    assert not viewer.root.exists() and time.monotonic() - began < 10
 
 
 @pytest.mark.parametrize("loopback", [True, False])
@@ -214,11 +32,18 @@ def test_nothing_is_answered_without_the_token(start: Start, loopback: bool) -> 
     token = viewer.access.token
     assert len(token) >= 43  # 256 bits
     stranger = viewer.outsider()
-    elsewhere = (f"/api/about?token={token}", f"/x?token={token}")
-    for path in ("/", "/api/about", "/api/model", "/assets/viewer.js", "/?token=wrong", "/?token=", *elsewhere):
+    elsewhere = (f"/view/model/api/about?token={token}", f"/x?token={token}")
+    for path in (
+        "/",
+        "/view/model/api/about",
+        "/view/model/api/model",
+        "/assets/viewer.js",
+        "/?token=wrong",
+        "/?token=",
+        *elsewhere,
+    ):
         refused = stranger.get(path)
         assert refused.status_code == 401 and "token" in sentence(refused)
-    assert upload(stranger, b"x").status_code == 401
     assert stranger.post(f"/?token={token}").status_code == 401
     invited = viewer.outsider()
     entered = invited.get(f"/?token={token}")
@@ -227,7 +52,7 @@ def test_nothing_is_answered_without_the_token(start: Start, loopback: bool) -> 
     assert "HttpOnly" in entered.headers["set-cookie"] and token not in entered.headers["set-cookie"]
     assert invited.get("/").status_code == 200
     assert "token" not in invited.get("/?token=wrong%0d%0aSet-Cookie:x=y").headers.get("set-cookie", "")
-    assert invited.get("/api/about").status_code == 200 and upload(invited, b"").status_code == 201
+    assert invited.get("/view/model/api/about").status_code == 200
 
 
 def test_the_ticket_that_opens_the_browser_is_good_once(start: Start) -> None:
@@ -239,27 +64,29 @@ def test_the_ticket_that_opens_the_browser_is_good_once(start: Start) -> None:
 
 @pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1.evil.example", ""])
 def test_on_loopback_other_host_names_are_refused(start: Start, host: str) -> None:
-    answer = start().user().get("/api/about", headers={"host": host})
+    answer = start().user().get("/view/model/api/about", headers={"host": host})
     assert answer.status_code in (400, 421)
 
 
 def test_other_pages_can_change_and_load_nothing(start: Start) -> None:
-    viewer = start(worker=agrees)
+    viewer = start()
     user = viewer.user()
     for origin in ("http://evil.example", "null", "http://127.0.0.1:1"):
-        assert user.put("/api/scans?name=a.ply", content=b"x", headers={"origin": origin}).status_code == 403
-        assert user.post("/api/export?format=ply", json={"z": []}, headers={"origin": origin}).status_code == 403
-    assert user.get("/api/model", headers={"sec-fetch-site": "cross-site"}).status_code == 403
+        assert (
+            user.post("/view/model/api/export?format=ply", json={"z": []}, headers={"origin": origin}).status_code
+            == 403
+        )
+    assert user.get("/view/model/api/model", headers={"sec-fetch-site": "cross-site"}).status_code == 403
     for kind, status in (("document", 200), ("iframe", 403)):
         headers = {"sec-fetch-site": "cross-site", "sec-fetch-mode": "navigate", "sec-fetch-dest": kind}
         assert viewer.user().get("/", headers=headers).status_code == status
     own = {"origin": viewer.address, "sec-fetch-site": "same-origin"}
-    assert user.put("/api/scans?name=a.ply", content=b"x", headers=own).status_code == 201
+    assert user.post("/view/model/api/export?format=ply", json={"z": []}, headers=own).status_code == 200
 
 
 def test_every_answer_forbids_what_the_page_does_not_need(start: Start) -> None:
     user = start().user()
-    for path in ("/", "/api/about", "/nothing", "/assets/viewer.js"):
+    for path in ("/", "/view/model/api/about", "/nothing", "/assets/viewer.js"):
         headers = user.get(path).headers
         assert "default-src 'none'" in headers["content-security-policy"]
         assert "frame-ancestors 'none'" in headers["content-security-policy"]
@@ -267,7 +94,9 @@ def test_every_answer_forbids_what_the_page_does_not_need(start: Start) -> None:
         assert headers["x-content-type-options"] == "nosniff" and headers["referrer-policy"] == "no-referrer"
 
 
-@pytest.mark.parametrize("path", ["/api/fits/..%2f..%2fmodel.h5", "/assets/..%2fserver.py", "/assets/fitting.py", "/x"])
+@pytest.mark.parametrize(
+    "path", ["/view/model/api/fits/..%2f..%2fmodel.h5", "/assets/..%2fserver.py", "/assets/guard.py", "/x"]
+)
 def test_no_address_leads_out_of_what_is_shown(start: Start, path: str) -> None:
     answer = start().user().get(path)
     assert answer.status_code == 404 and sentence(answer)
@@ -276,7 +105,7 @@ def test_no_address_leads_out_of_what_is_shown(start: Start, path: str) -> None:
 @pytest.mark.parametrize("kind", ["ply", "obj", "stl"])
 def test_an_exported_shape_is_the_models(start: Start, model: ShapeModel, kind: str, tmp_path: Path) -> None:
     z = [1.5, -2.0, 0.25]
-    answer = start().user().post(f"/api/export?format={kind}", json={"z": z})
+    answer = start().user().post(f"/view/model/api/export?format={kind}", json={"z": z})
     path = tmp_path / f"shape.{kind}"
     path.write_bytes(answer.content)
     expected = model.reconstruct(np.array(z) * model.stddev[:3])
@@ -290,39 +119,8 @@ def test_an_exported_shape_is_the_models(start: Start, model: ShapeModel, kind: 
     "question", [{"z": [0] * 99}, {"z": ["a"]}, {"z": None}, {"z": [1e300]}, {"fit": "none"}, {"scan": "none"}, []]
 )
 def test_an_export_of_what_there_is_not_is_one_sentence(start: Start, question: object) -> None:
-    answer = start().user().post("/api/export?format=ply", json=question)
+    answer = start().user().post("/view/model/api/export?format=ply", json=question)
     assert answer.status_code in (400, 404, 422) and sentence(answer)
-
-
-def test_a_doubtful_fit_is_helped_by_landmarks_and_by_no_nonsense(
-    start: Start, model: ShapeModel, scan_file: Path
-) -> None:
-    viewer = start(worker=doubts)
-    user = viewer.user()
-    key = upload(user, scan_file.read_bytes()).json()["id"]
-    events = wait_for_events(user, key)
-    assert events[-2]["status"] == "doubtful" and events[-1]["can_place_landmarks"]
-    good = {name: model.mean_vertices[vertex].tolist() for name, vertex in model.landmarks.items()}
-
-    def place(landmarks: object) -> httpx.Response:
-        return user.post(f"/api/scans/{key}/landmarks", json={"landmarks": landmarks})
-
-    for bad in ({}, dict(list(good.items())[:2]), good | {"=evil()": [0, 0, 0]}, good | {"tip": [0, "a", 0]}, [1]):
-        assert place(bad).status_code == 400 and sentence(place(bad))
-    assert place(good).status_code == 200
-    events = wait_for_events(user, key)
-    assert events[-2]["status"] == "converged" and events[-2]["start"] == "landmarks"
-    assert place(good).status_code == 409 and not list(viewer.root.rglob("upload-*"))
-
-
-def doubts(pipe: Connection, upload: Upload) -> None:
-    """Doubt every scan without landmarks; with them fit it for once."""
-    if upload.landmarks:
-        fit_upload(pipe, upload)
-        return
-    for event in ({"event": "scan"}, {"event": "verdict", "status": "doubtful", "reason": "It is not."}):
-        pipe.send_bytes(json.dumps(event).encode())
-    time.sleep(60)
 
 
 @pytest.fixture
@@ -340,7 +138,7 @@ def fits(model: ShapeModel, scan_file: Path, tmp_path: Path) -> Path:
 
 def test_the_fits_of_a_folder_are_listed_worst_first_and_shown(start: Start, fits: Path, model: ShapeModel) -> None:
     user = start(ModelView.open(fits)).user()
-    listed = user.get("/api/fits").json()
+    listed = user.get("/view/model/api/fits").json()
     assert [(row["name"], row["status"], row["pictured"]) for row in listed] == [
         ("d", "unreadable", False),
         ("c", "failed", False),
@@ -348,18 +146,18 @@ def test_the_fits_of_a_folder_are_listed_worst_first_and_shown(start: Start, fit
         ("b", "converged", True),
     ]
     assert len(listed[2]["z"]) == model.n_modes
-    assert len(user.get("/api/fits/a").content) > 10_000
-    assert len(user.get("/api/fits/b").content) > 10_000
+    assert len(user.get("/view/model/api/fits/a").content) > 10_000
+    assert len(user.get("/view/model/api/fits/b").content) > 10_000
     for name in ("c", "d"):
-        answer = user.get(f"/api/fits/{name}")
+        answer = user.get(f"/view/model/api/fits/{name}")
         assert answer.status_code == 422 and sentence(answer)
-    saved = user.post("/api/export?format=ply", json={"fit": "a"})
+    saved = user.post("/view/model/api/export?format=ply", json={"fit": "a"})
     sent, written = read_ply(saved.content, Path("a.ply")), read_mesh(fits / "a.fitted.ply")
     assert np.array_equal(sent.vertices, written.vertices) and np.array_equal(sent.faces, written.faces)
     record = json.loads((fits / "a.fit.json").read_text())
     record["distances_mm"]["final"]["model_to_scan"]["mean"] = "far"
     (fits / "e.fit.json").write_text(json.dumps(record | {"status": "<script>"}))
-    assert [(row["name"], row["status"]) for row in user.get("/api/fits").json()][:2] == [
+    assert [(row["name"], row["status"]) for row in user.get("/view/model/api/fits").json()][:2] == [
         ("d", "unreadable"),
         ("e", "unreadable"),
     ]
@@ -367,7 +165,7 @@ def test_the_fits_of_a_folder_are_listed_worst_first_and_shown(start: Start, fit
 
 def test_a_fit_without_stages_is_shown_from_its_surfaces_and_its_scan(start: Start, fits: Path) -> None:
     user = start(ModelView.open(fits)).user()
-    (_, staged), (facts, plain) = (unpacked(user.get(f"/api/fits/{name}").content) for name in ("a", "b"))
+    (_, staged), (facts, plain) = (unpacked(user.get(f"/view/model/api/fits/{name}").content) for name in ("a", "b"))
     assert facts["stages"] == ["final"] and "regions" not in plain
     assert np.allclose(plain["scan"], staged["scan"], atol=1e-3)
     assert np.allclose(plain["surface_final"], staged["surface_final"], atol=1e-3)
@@ -377,7 +175,7 @@ def test_a_fit_without_stages_is_shown_from_its_surfaces_and_its_scan(start: Sta
     record = json.loads((fits / "b.fit.json").read_text())
     (fits / "b.fit.json").write_text(json.dumps(record | {"scan": {**record["scan"], "path": "gone.ply"}}))
     user = start(ModelView.open(fits)).user()
-    facts, alone = unpacked(user.get("/api/fits/b").content)
+    facts, alone = unpacked(user.get("/view/model/api/fits/b").content)
     assert np.allclose(alone["surface_final"], plain["surface_final"]) and "scan" not in alone
     assert facts["without_scan"].startswith("The fitted surface is shown alone, since the scan is no longer")
 
@@ -420,14 +218,14 @@ def test_no_folder_of_this_machine_reaches_a_user(start: Start, fits: Path, tmp_
     (fits / "f.fit.json").write_text(json.dumps(record))
     (fits / "a.stages.npz").write_bytes(b"damaged")
     user = start(ModelView.open(fits)).user()
-    answers = [user.get("/api/fits"), user.get("/api/fits/a"), user.get("/api/fits/d")]
+    answers = [user.get("/view/model/api/fits"), user.get("/view/model/api/fits/a"), user.get("/view/model/api/fits/d")]
     assert [answer.status_code for answer in answers] == [200, 422, 422]
     assert all(str(tmp_path.parent) not in answer.text and tmp_path.name not in answer.text for answer in answers)
     reasons = {row["name"]: row["reason"] for row in answers[0].json()}
     assert "empty.ply: it is empty" in reasons["c"] and reasons["f"] == "Cannot read a scan.ply: it is empty."
     assert "d.fit.json" in reasons["d"] and "a.stages.npz" in sentence(answers[1])
     (fits / "a.fitted.ply").unlink()
-    gone = user.post("/api/export?format=ply", json={"fit": "a"})
+    gone = user.post("/view/model/api/export?format=ply", json={"fit": "a"})
     assert tmp_path.name not in gone.text and sentence(gone)
 
 

@@ -136,7 +136,7 @@ def test_log_messages_reports_and_pages_of_the_server_have_labels(tmp_path: Path
         job = state(client)["jobs"][0]
         assert job["message"] == "x: crop it (option “Crop”)." and job["command"] == "shapespace x --seed=1"
         assert client.get("/api/jobs/1/log").text == "shapespace: x: crop it (option “Crop”).\n"
-        report = client.get("/view/1/")
+        report = client.get("/view/1/report/")
         assert "Use the option “Variances of classes”: unequal." in report.text
         assert "sandbox" in report.headers["content-security-policy"]
         rejected = client.post("/api/checks", json={"kind": "regress", "options": {}, "on": None}).json()

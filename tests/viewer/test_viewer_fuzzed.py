@@ -8,24 +8,23 @@ import logging
 import os
 import socket
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from starlette.types import ASGIApp
 from viewer_world import VERTICES, enter, served
 
 from same_blobs import write_same
-from shapespace.viewer import uploaded_scans as scans_module
 from shapespace.viewer.corresponding_surfaces import Surfaces
-from shapespace.viewer.guard import Access
+from shapespace.viewer.guard import Access, Guard
 from shapespace.viewer.model_view import ModelView
-from shapespace.viewer.server import make_app, make_surfaces_app
-from shapespace.viewer.uploaded_scans import Scans, UploadLimits
+from shapespace.viewer.server import model_app, surfaces_app
+from shapespace.viewer.studio.views import ViewKind, single_result_app
 from synthetic_shapes import blob_model
 
 BY_HAND = int(os.environ.get("SHAPESPACE_FUZZ", "0"))
@@ -37,16 +36,18 @@ MANY = settings(
 
 @dataclass(frozen=True)
 class Target:
-    """A viewer that runs, the cookie of its user, an uploaded scan, and the log of the server."""
+    """A viewer that runs, the kind of its view, the cookie of its user, and the log of the server."""
 
     address: tuple[str, int]
+    kind: str
     cookies: str
-    scan: str
     log: list[str]
 
 
 @contextmanager
-def target(app: Any, access: Access) -> Iterator[Target]:
+def target(kind: ViewKind, view: ASGIApp) -> Iterator[Target]:
+    access = Access()
+    app = Guard(single_result_app("result", {kind: view}), access=access, cookie_name="shapespace", loopback=True)
     log: list[str] = []
     handler = logging.Handler(logging.WARNING)
     handler.emit = lambda record: log.append(record.getMessage())
@@ -56,11 +57,9 @@ def target(app: Any, access: Access) -> Iterator[Target]:
             logger.addHandler(handler)
         try:
             enter(user, access)
-            uploaded = user.put("/api/scans?name=a.ply", content=b"x")
             host, port = address.removeprefix("http://").split(":")
             cookies = "; ".join(f"{key}={value}" for key, value in user.cookies.items())
-            scan = uploaded.json()["id"] if uploaded.status_code == 201 else ""
-            yield Target((host, int(port)), cookies, scan, log)
+            yield Target((host, int(port)), kind, cookies, log)
         finally:
             for logger in loggers:
                 logger.removeHandler(handler)
@@ -68,25 +67,19 @@ def target(app: Any, access: Access) -> Iterator[Target]:
 
 @pytest.fixture(scope="module")
 def fits(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Target]:
-    """A viewer of records that are mostly nonsense; every fit fails at once."""
+    """A viewer of records that are mostly nonsense."""
     folder = tmp_path_factory.mktemp("fits")
     model = blob_model(VERTICES)
     good = {"format": "shapespace fit", "status": "converged", "model": {"hash": model.content_hash}, "z": [1]}
     for name, record in (("good", good), ("huge", {**good, "evidence": {"expected_error_mm": 10**400}}), ("list", [])):
         (folder / f"{name}.fit.json").write_text(json.dumps(record))
-    with ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scans_module, "run_worker", lambda *_: "It was not fitted.")
-        access = Access()
-        scans = Scans(Path(tmp_path_factory.mktemp("scans")), model, "m.h5", UploadLimits(upload_bytes=5000))
-        stack.callback(scans.close)
-        yield stack.enter_context(target(make_app(ModelView(model, "m.h5", folder), scans, access), access))
+    with target("model", model_app(ModelView(model, "m.h5", folder))) as one:
+        yield one
 
 
 @pytest.fixture(scope="module")
 def surfaces(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Target]:
-    access = Access()
-    view = Surfaces(write_same(tmp_path_factory.mktemp("blobs")))
-    with target(make_surfaces_app(view, access), access) as one:
+    with target("surfaces", surfaces_app(Surfaces(write_same(tmp_path_factory.mktemp("blobs"))))) as one:
         yield one
 
 
@@ -98,13 +91,11 @@ TEXT = st.one_of(
     st.text(st.characters(max_codepoint=255), max_size=12),
 )  # fmt: skip
 ROUTES = (
-    "GET /", "GET /assets/X", "GET /api/about", "GET /api/model", "GET /api/fits", "GET /api/fits/X", "HEAD /X",
-    "POST /api/export?format=X", "POST /api/export?format=ply", "GET /api/scans", "PUT /api/scans?name=X",
-    "PUT /api/scans?name=a.ply", "DELETE /api/scans/X", "GET /api/scans/ID/X", "GET /api/scans/ID/progress?after=X",
-    "GET /api/scans/ID/preview", "GET /api/scans/ID/record", "GET /api/scans/X/picture", "POST /api/scans/ID/landmarks",
-    "POST /api/scans/ID/cancel", "GET /api/mean", "GET /api/surfaces", "GET /api/surfaces/X", "X /api/scans/ID/X",
-    "GET /api/places?vertices=X", "GET /api/places?vertices=1,X", "GET /?token=X", "GET /?X=X", "GET X", "OPTIONS *",
-    "X /", "CONNECT http://X/", "POST /api/scans", "PATCH /api/scans/ID",
+    "GET /", "GET /assets/X", "GET /api/project", "GET KIND/api/about", "GET KIND/api/model", "GET KIND/api/fits",
+    "GET KIND/api/fits/X", "HEAD /X", "POST KIND/api/export?format=X", "POST KIND/api/export?format=ply",
+    "GET KIND/api/mean", "GET KIND/api/surfaces", "GET KIND/api/surfaces/X", "GET KIND/api/faults/X", "X KIND/api/X",
+    "GET KIND/api/places?vertices=X", "GET KIND/api/places?vertices=1,X", "GET /view/X", "GET /view/X/api/about",
+    "GET /?token=X", "GET /?X=X", "GET X", "OPTIONS *", "X /", "CONNECT http://X/", "PUT KIND/api/export?format=X",
 )  # fmt: skip
 HEADERS = st.lists(
     st.tuples(
@@ -147,7 +138,7 @@ class Asked:
             own["Cookie"] = at.cookies
         if self.sized:
             own["Content-Length"] = str(len(self.body))
-        lines = [f"{self.line.replace('ID', at.scan)} HTTP/1.1"]
+        lines = [f"{self.line.replace('KIND', f'/view/{at.kind}')} HTTP/1.1"]
         lines += [f"{name}: {value}" for name, value in (*own.items(), *self.headers)]
         return "\r\n".join(lines).encode("latin-1") + b"\r\n\r\n" + self.body
 
@@ -196,5 +187,7 @@ def test_no_request_is_the_fault_of_the_viewer_of_surfaces(surfaces: Target, ask
 
 def test_after_all_that_the_user_is_served(fits: Target, surfaces: Target) -> None:
     for one in (fits, surfaces):
-        came = answered(one, f"GET /api/about HTTP/1.1\r\nHost: localhost\r\nCookie: {one.cookies}\r\n\r\n".encode())
+        came = answered(
+            one, f"GET /view/{one.kind}/api/about HTTP/1.1\r\nHost: localhost\r\nCookie: {one.cookies}\r\n\r\n".encode()
+        )
         assert came.startswith(b"HTTP/1.1 200")

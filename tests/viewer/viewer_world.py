@@ -3,13 +3,11 @@
 import json
 import socket
 import struct
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +15,13 @@ import httpx
 import numpy as np
 import pytest
 
-from shapespace.batch.workers import start_loading
 from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.model.shape_model import ShapeModel
-from shapespace.viewer.fitting import Upload, Worker, fit_upload
-from shapespace.viewer.guard import Access
+from shapespace.viewer.guard import Access, Guard
 from shapespace.viewer.model_view import ModelView
 from shapespace.viewer.serve import make_server
-from shapespace.viewer.server import make_app
-from shapespace.viewer.uploaded_scans import Scans, UploadLimits
+from shapespace.viewer.server import model_app
+from shapespace.viewer.studio.views import single_result_app
 from synthetic_shapes import blob_model, raw_scan, similarity
 
 VERTICES = 400
@@ -58,13 +54,8 @@ class Running:
     """A viewer that runs."""
 
     address: str
-    scans: Scans
     access: Access
     clients: ExitStack = field(default_factory=ExitStack)
-
-    @property
-    def root(self) -> Path:
-        return self.scans.root
 
     def outsider(self) -> httpx.Client:
         """Return a browser without the token."""
@@ -102,13 +93,12 @@ def served(app: Any) -> Iterator[str]:
 
 
 @contextmanager
-def running(view: ModelView, limits: UploadLimits, worker: Worker, loopback: bool = True) -> Iterator[Running]:
+def running(view: ModelView, loopback: bool = True) -> Iterator[Running]:
     access = Access()
-    with tempfile.TemporaryDirectory() as root, ExitStack() as clients:
-        scans = Scans(Path(root), view.model, view.model_name, limits, worker=worker)
-        clients.callback(scans.close)
-        with served(make_app(view, scans, access, loopback=loopback)) as address:
-            yield Running(address, scans, access, clients)
+    page = single_result_app(view.model_name, {"model": model_app(view)})
+    app = Guard(page, access=access, cookie_name="shapespace", loopback=loopback)
+    with ExitStack() as clients, served(app) as address:
+        yield Running(address, access, clients)
 
 
 @pytest.fixture(scope="session")
@@ -119,18 +109,10 @@ def model() -> ShapeModel:
 @pytest.fixture
 def start(model: ShapeModel) -> Iterator[Start]:
     """Start a viewer of `model` or of another view."""
-    start_loading(notify=False)
     with ExitStack() as stack:
 
-        def start(
-            view: ModelView | None = None,
-            *,
-            worker: Worker = fit_upload,
-            loopback: bool = True,
-            **limits: Any,
-        ) -> Running:
-            view = view or ModelView(model, "blobs.h5")
-            return stack.enter_context(running(view, UploadLimits(**limits), worker, loopback))
+        def start(view: ModelView | None = None, *, loopback: bool = True) -> Running:
+            return stack.enter_context(running(view or ModelView(model, "blobs.h5"), loopback))
 
         yield start
 
@@ -142,32 +124,6 @@ def scan_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scan = raw_scan(z, similarity(3, degrees=8, scale=1.0), vertices=1000, model_vertices=VERTICES, noise_mm=0.1).scan
     write_mesh(path, scan)
     return path
-
-
-def agrees(pipe: Connection, upload: Upload) -> None:
-    """Converge without a fit."""
-    pipe.send_bytes(json.dumps({"event": "verdict", "status": "converged", "reason": "It is good."}).encode())
-    time.sleep(60)
-
-
-def waits(pipe: Connection, upload: Upload) -> None:
-    """Never end."""
-    time.sleep(60)
-
-
-def upload(client: httpx.Client, content: bytes, name: str = "scan.ply") -> httpx.Response:
-    return client.put("/api/scans", params={"name": name}, content=content)
-
-
-def wait_for_events(client: httpx.Client, key: str) -> list[dict[str, Any]]:
-    """Return all messages of a fit once it is done, and then the state of the scan."""
-    until(lambda: progress(client, key)["state"] == "done", 60)
-    done = progress(client, key)
-    return [*done.pop("events"), done]
-
-
-def progress(client: httpx.Client, key: str) -> dict[str, Any]:
-    return client.get(f"/api/scans/{key}/progress").json()
 
 
 def until(condition: Callable[[], object], seconds: float = 15) -> None:

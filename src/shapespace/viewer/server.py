@@ -1,4 +1,4 @@
-"""The data of the page's parts as applications: a model with its fits, surfaces; and what all applications share."""
+"""Models with their fits, and surfaces, as applications that send the data of the page; parts that all applications share."""
 
 from __future__ import annotations
 

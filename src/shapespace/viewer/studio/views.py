@@ -94,7 +94,7 @@ class Views:
         """Answer one request of a view."""
         number, kind, *_ = [*get_route_path(scope).lstrip("/").split("/"), ""]
         path = self._result(int(number)) if number.isdigit() and len(number) < 8 else None
-        known: list[ViewKind] = [] if path is None else [one for one in view_kinds(path) if one == kind]
+        known: list[ViewKind] = [] if path is None else [shown for shown in view_kinds(path) if shown == kind]
         if path is None or not known:
             await refusal(404, "There is no view of this result; reload the studio.")(scope, receive, send)
             return
