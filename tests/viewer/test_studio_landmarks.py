@@ -97,7 +97,7 @@ def test_points_of_curves_are_not_imported(project: Project) -> None:
     ("table.csv", b"id,sex\nanna,f\n", False), ("anna.csv", b"id,sex\nanna,f\n", False),
     ("anna.csv", b"name,x,y,z\nnose,1,2,3\n", True), ("anna.csv", b"nose,1,2,3\near,1,2,3\n", True),
     ("sites.csv", b"name,x,y,z\nanna,1,2,3\n", False), ("all.csv", b"id,x1,y1,z1,x2,y2,z2\nanna,1,2,3,4,5,6\n", True),
-    ("flat.csv", b"id,x1,y1,x2,y2\nanna,1,2,4,5\n", False), ("bad.csv", b"id,x1,y1,z1,x2,y2,z2\nanna,1,2\n", True),
+    ("flat.csv", b"id,x1,y1,x2,y2\nanna,1,2,4,5\n", False),
     ("long.csv", b"specimen,landmark,x,y,z\nanna,a,1,2,3\n", True),
     ("empty.csv", b"", False), ("binary.csv", b"\xd0\xcf\x11\xe0", False),
 ])  # fmt: skip
@@ -105,16 +105,18 @@ def test_a_table_of_covariates_is_no_table_of_landmarks(
     project: Project, name: str, content: bytes, expected: bool
 ) -> None:
     assert is_landmark_table(content, name, project.state) is expected
+    with pytest.raises(FileFormatError, match=r"bad\.csv"):
+        is_landmark_table(b"id,x1,y1,z1,x2,y2,z2\nanna,a,b\n", "bad.csv", project.state)
 
 
 def test_landmarks_are_placed_moved_and_removed_and_undo_takes_it_back(project: Project) -> None:
     states = [project.state]
     for request in (
-        {"what": "add-point", "name": "nose"},
+        {"what": "point-names", "names": ["nose"]},
         {"what": "points", "id": "anna", "points": {"nose": [1, 2, 3]}, "before": {"nose": None}},
         {"what": "points", "id": "anna", "points": {"nose": [1, 2, 4]}, "before": {"nose": [1.0, 2.0, 3.0]}},
         {"what": "points", "id": "anna", "points": {"ear": [0, 0, 0], "nose": None}},
-        {"what": "remove-point", "name": "ear"},
+        {"what": "point-names", "names": ["nose"]},
     ):
         edit(project, **request)
         states.append(project.state)
@@ -144,10 +146,10 @@ def test_a_landmark_that_another_tab_moved_in_the_meantime_is_not_overwritten(pr
     ({"what": "points", "id": "anna", "points": {"nose": [1, 2]}}, "cannot be read"),
     ({"what": "points", "id": "anna", "points": {"nose": [1, 2, float("nan")]}}, "three finite coordinates"),
     ({"what": "points", "id": "anna", "points": {"": [1, 2, 3]}}, "cannot be called"),
-    ({"what": "add-point", "name": " "}, "cannot be called"),
-    ({"what": "add-point", "name": "#1"}, "begins a comment"),
-    ({"what": "add-point", "name": "a\nb"}, "cannot be called"),
-    ({"what": "remove-point", "name": "nose"}, "no landmark 'nose'"),
+    ({"what": "point-names", "names": [" "]}, "cannot be called"),
+    ({"what": "point-names", "names": ["#1"]}, "cannot be called '#1'"),
+    ({"what": "point-names", "names": ["a\nb"]}, "cannot be called"),
+    ({"what": "point-names"}, "cannot be read"),
 ])  # fmt: skip
 def test_landmarks_that_cannot_be_are_refused_in_a_sentence(
     project: Project, request_: dict[str, object], message: str
@@ -206,6 +208,11 @@ def test_results_are_outdated_by_an_edit_of_the_landmarks_that_they_used(project
     project.undo(project.revision)
     edit(project, what="include", ids=["ben"], included=False)
     assert 1 not in done.outdated and done.outdated[3] == "landmarks"
+    done.run("redo", {"name": "ben"})
+    assert done.jobs[-1].arguments == ("correspond", "inputs/0004.csv", "--redo", "ben", "-o", "correspondence-1")
+    assert "inputs/0004-landmarks/ben.csv" in {
+        path.relative_to(project.folder).as_posix() for path in project.folder.glob("inputs/*/*")
+    }
 
 
 def test_a_fit_takes_landmarks_of_which_the_model_knows_three(project: Project) -> None:

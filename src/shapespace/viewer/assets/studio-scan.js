@@ -78,12 +78,14 @@
       <small class="hint">${M.file}</small></fieldset>`;
   }
 
+  const setNames = (names) => Studio.edit({ what: "point-names", names });
+
   /** A form that adds the name of a landmark. */
   function AddName({ onadd }) {
     const [name, setName] = useState("");
     const add = async (event) => {
       event.preventDefault();
-      if (await Studio.edit({ what: "add-point", name })) { onadd(name.trim()); setName(""); }
+      if (await setNames([...Studio.state.project.point_names, name])) { onadd(name.trim()); setName(""); }
     };
     return html`<form class="row" onsubmit=${add}><input required size="14" aria-label=${M.name} placeholder=${M.name} data-testid="mark-name" value=${name} oninput=${(event) => setName(event.target.value)} />
       <button class="small" data-testid="mark-add" disabled=${!name.trim()}>${M.add}</button></form>`;
@@ -172,7 +174,7 @@
           <div class="table-box preview" role="region" aria-label=${M.title} tabindex="0"><table class="plain">
             <thead><tr><th scope="col">${M.title}</th><th scope="col">${M.specimens}</th><th scope="col"><span class="hidden">${S.remove}</span></th></tr></thead>
             <tbody>${names.map((name) => html`<tr key=${name}><th scope="row">${name}</th><td>${M.of(specimens.filter((one) => one.points[name]).length, specimens.length)}</td>
-              <td><${Button} edits small class="quiet" aria-label=${M.removeAll(name)} testid=${`landmark-remove-${name}`} onclick=${() => Studio.edit({ what: "remove-point", name })}>×<//></td></tr>`)}</tbody></table></div>
+              <td><${Button} edits small class="quiet" aria-label=${M.removeAll(name)} testid=${`landmark-remove-${name}`} onclick=${() => setNames(names.filter((other) => other !== name))}>×<//></td></tr>`)}</tbody></table></div>
           ${!Studio.state.read_only && html`<${Studio.JobForm} kind="landmarks" label=${Studio.action("landmarks")} />`}
           <${Studio.Jobs} kinds=${["landmarks"]} />
           ${done && html`<${Studio.Outdated} job=${done} />`}

@@ -8,18 +8,13 @@ import io
 import re
 from collections.abc import Collection, Mapping, Sequence
 from functools import lru_cache
-from math import nan
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
 from shapespace.cohort.read import cohort_file_text
-from shapespace.cohort.table import Table, is_number, list_names, name_key
+from shapespace.cohort.table import Table, is_number, list_names
 from shapespace.errors import FileError, InputError, ShapespaceError
 from shapespace.io.landmarks.configuration_io import CONFIGURATION_FORMATS
-from shapespace.io.landmarks.configuration_tables import long_text
-from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations
 from shapespace.io.tables.table_io import DECIMAL_COMMA
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import CorrespondRecord
@@ -152,7 +147,9 @@ def order(
     if kind in ("fit", "complete"):
         model = result_of(jobs, ("build",), on).output
         chosen = _require_specimens(state.chosen("new"), "to fit; drop new scans", 1)
-        files, prepared = project.scan_list(folder / listed, chosen, lambda: _landmark_names(folder / model))
+        has_points, path = any(specimen.points for specimen in chosen), folder / model
+        names = _landmark_names(path, path.stat().st_mtime if path.is_file() else 0.0) if has_points else ()
+        files, prepared = project.scan_list(folder / listed, chosen, names)
         output = f"{'fits' if kind == 'fit' else 'completed'}-{number}"
         return Order((*words, model, listed, "-o", output, *given), output, prepared, files=files)
     if kind == "landmarks":
@@ -181,31 +178,24 @@ def order(
 
 
 def _export_landmarks(project: Project, words: tuple[str, ...], given: Sequence[str], to: str, number: int) -> Order:
-    """Return the command that writes the landmarks on scans, in the frames and units of their files."""
-    names, included = project.state.point_names, (*project.state.chosen("training"), *project.state.chosen("new"))
-    marked = sorted((one for one in included if one.points), key=lambda specimen: name_key(specimen.id))
+    """Return the command that writes the landmarks of the included scans."""
+    included = (*project.state.chosen("training"), *project.state.chosen("new"))
+    marked = [specimen for specimen in included if specimen.points]
     if not marked:
         raise InputError("No included specimen has landmarks; place some on a scan, or import a file of landmarks.")
-    missing = (nan, nan, nan)
-    points = np.array([[specimen.points.get(name, missing) for name in names] for specimen in marked])
-    ids = tuple(specimen.id for specimen in marked)
-    listed = f"{_INPUTS}/{number:04d}-landmarks.csv"
-    files = {listed: long_text(LandmarkConfigurations(names=ids, points=points, landmarks=names))}
-    output = f"landmarks-{number}{CONFIGURATION_FORMATS.get(to, '')}"
-    return Order((*words, listed, "-o", output, *given), output, files=files)
+    listed, output = f"{_INPUTS}/{number:04d}-landmarks.csv", f"landmarks-{number}{CONFIGURATION_FORMATS.get(to, '')}"
+    return Order((*words, listed, "-o", output, *given), output, files={listed: project.point_table(marked)})
 
 
 @lru_cache(maxsize=8)
-def _read_landmark_names(model: Path, modified_ns: int) -> frozenset[str]:
-    """Return the names of the landmarks of the model that was written at a time; the page asks again and again."""
-    return frozenset(ShapeModel.load(model).landmarks)
+def _landmark_names(model: Path, modified_s: float) -> frozenset[str]:
+    """Return the names of the landmarks of the model that was written at a time; the page asks again and again.
 
-
-def _landmark_names(model: Path) -> frozenset[str]:
-    """Return the names of the landmarks of a model; none if it cannot be read, which its command reports."""
+    A model that cannot be read, which its command reports, has none.
+    """
     try:
-        return _read_landmark_names(model, model.stat().st_mtime_ns)
-    except (OSError, ShapespaceError):
+        return frozenset(ShapeModel.load(model).landmarks)
+    except ShapespaceError:
         return frozenset()
 
 

@@ -13,7 +13,7 @@ from shapespace.io.landmarks.configuration_io import read_configurations
 from shapespace.io.landmarks.configuration_tables import header_kind, parse_table
 from shapespace.io.landmarks.landmark_configurations import LandmarkConfigurations
 from shapespace.io.tables.table_io import table_rows
-from shapespace.viewer.studio.project import Point, State
+from shapespace.viewer.studio.project import Point, State, point_of
 
 
 def is_landmark_table(content: bytes, name: str, state: State) -> bool:
@@ -24,6 +24,9 @@ def is_landmark_table(content: bytes, name: str, state: State) -> bool:
         content: content of the file.
         name: name of the file.
         state: state of the project.
+
+    Raises:
+        FileFormatError: landmarks that cannot be read.
     """
     try:
         header = next(table_rows(content), list[str]())
@@ -31,10 +34,7 @@ def is_landmark_table(content: bytes, name: str, state: State) -> bool:
         return False  # the reader of tables reports the problem
     kind = header_kind(header)
     if kind in ("wide", "long"):
-        try:
-            return parse_table(content, Path(name)).dimensions == 3
-        except ShapespaceError:
-            return True  # the reader of landmarks reports the problem
+        return parse_table(content, Path(name)).dimensions == 3
     has_rows = kind == "single" or (len(header) == 4 and all(map(is_number, header[1:])))
     return has_rows and _is_known(Path(name).stem, state)
 
@@ -70,7 +70,7 @@ def points_of_file(
     points: dict[str, dict[str, Point]] = {}
     for row, place in matched.items():
         seen = [k for k in kept if raw.observed[row, k]]
-        points[state.specimens[place].id] = {raw.landmarks[k]: _point(raw.points[row, k].tolist()) for k in seen}
+        points[state.specimens[place].id] = {raw.landmarks[k]: point_of(raw.points[row, k]) for k in seen}
     notes = [note.replace(raw.where, name) for note in raw.notes if not (on_curves and "semilandmarks" in note)]
     if on_curves:
         notes.append(f"{name}: the points of curves are semilandmarks, which are not imported.")
@@ -93,8 +93,3 @@ def _read(content: bytes, name: str) -> LandmarkConfigurations:
 
 def _is_known(name: str, state: State) -> bool:
     return fold_name(name) in {fold_name(known) for own in state.names for known in own}
-
-
-def _point(values: list[float]) -> Point:
-    x, y, z = values
-    return x, y, z

@@ -21,7 +21,15 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from shapespace.batch.result_folder import names_for
-from shapespace.cohort.table import fold_name, is_number, match_rows, names_of_file, notes_on_classes, read_table
+from shapespace.cohort.table import (
+    fold_name,
+    is_number,
+    match_rows,
+    name_key,
+    names_of_file,
+    notes_on_classes,
+    read_table,
+)
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.containers.json_files import read_json
 from shapespace.io.files import atomic_path, make_folder, write_error, write_text
@@ -352,7 +360,7 @@ class Project:
     # Files that commands read
 
     def scan_list(
-        self, path: Path, specimens: Sequence[Specimen], names: Callable[[], Collection[str]] | None = None
+        self, path: Path, specimens: Sequence[Specimen], names: Collection[str] | None = None
     ) -> tuple[dict[str, str], tuple[tuple[str, ...], ...]]:
         """Return the list of scans with their ids and cells, as `correspond` and `fit` read it, with the files of their
         landmarks, and the commands that write scans in mm and their mirror images, whose output the list names.
@@ -360,8 +368,8 @@ class Project:
         Args:
             path: path of the list, in a folder of the project.
             specimens: specimens of the list.
-            names: function that returns the names of the landmarks that the command knows; scans with fewer than
-                three of them, which determine no pose, are listed without landmarks. None for all landmarks.
+            names: names of the landmarks that the command knows; scans with fewer than three of these landmarks, which
+                determine no pose, are listed without landmarks. None for all landmarks.
         """
         columns, commands = self.state.columns, list[tuple[str, ...]]()
         columns = tuple(column for column in columns if column.lower() != LANDMARK_COLUMN)  # it would name files
@@ -403,9 +411,18 @@ class Project:
         others = of_scans.select([name for name in of_scans.names if name not in placed])
         return surface_landmarks_text(others.joined(placed))
 
-    def _landmark_texts(
-        self, specimens: Iterable[Specimen], names: Callable[[], Collection[str]] | None
-    ) -> dict[str, str]:
+    def point_table(self, specimens: Iterable[Specimen]) -> str:
+        """Return the landmarks on scans, in the frames and units of their files, as a table with a row for each one, as
+        `landmarks convert` reads it; specimens are sorted by name.
+        """
+        rows = [
+            (specimen.id, name, *specimen.points.get(name, ("NA",) * 3))
+            for specimen in sorted(specimens, key=lambda specimen: name_key(specimen.id))
+            for name in self.state.point_names
+        ]
+        return table_text(("specimen", "landmark", *"xyz"), rows)
+
+    def _landmark_texts(self, specimens: Iterable[Specimen], names: Collection[str] | None) -> dict[str, str]:
         """Return id -> table of the landmarks of each specimen that has some, as they are on the scan that commands
         read: in mm if it has a unit, and reflected if it is mirrored. See `scan_list` for `names`.
         """
@@ -416,7 +433,7 @@ class Project:
             rows = [
                 (name, *map(mul, factors, specimen.points[name]))
                 for name in self.state.point_names
-                if name in specimen.points and (names is None or name in names())
+                if name in specimen.points and (names is None or name in names)
             ]
             if len(rows) >= (1 if names is None else LEAST_LANDMARKS):
                 texts[specimen.id] = table_text(("name", *"xyz"), rows)
@@ -545,7 +562,7 @@ def change_of(request: Mapping[str, Any]) -> Callable[[State], tuple[str, State]
         "cells": _edit_cells, "block": _edit_block, "include": _include, "set": _set_role, "remove": _remove,
         "rename": _rename, "unit": _set_unit, "mirror": _mirror, "add-column": _add_column,
         "remove-column": _remove_column, "landmarks": _set_landmarks, "points": _edit_points,
-        "add-point": _add_point, "remove-point": _remove_point,
+        "point-names": _set_point_names,
     }  # fmt: skip
 
     def change(state: State) -> tuple[str, State]:
@@ -680,12 +697,12 @@ def _edit_points(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
     name, wanted = str(request["id"]), dict(request["points"])
     now = next((specimen.points for specimen in state.specimens if specimen.id == name), dict[str, Point]())
     for mark, before in request.get("before", {}).items():
-        if now.get(mark) != (None if before is None else _point_of(before)):
+        if now.get(mark) != (None if before is None else point_of(before)):
             raise StaleError(
                 f"Another tab changed the landmark {mark[:_LONGEST_NAME]} of {name} in the meantime; look at it, and "
                 "place it again if it is wrong."
             )
-    placed = {mark: _point_of(point) for mark, point in wanted.items() if point is not None}
+    placed = {mark: point_of(point) for mark, point in wanted.items() if point is not None}
     others = {mark: point for mark, point in now.items() if mark not in wanted}
     _, edited = with_points(tuple(placed), {name: placed})(
         _edit_specimens(state, [name], lambda specimen: replace(specimen, points=others))
@@ -694,30 +711,28 @@ def _edit_points(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
     return f"{'place' if placed else 'remove'} {marks} {'on' if placed else 'from'} {name}", edited
 
 
-def _point_of(values: Any) -> Point:
+def point_of(values: Iterable[Any]) -> Point:
+    """Return the coordinates of a landmark.
+
+    Raises:
+        InputError: a coordinate is not finite.
+        TypeError, ValueError: they are not three numbers.
+    """
     x, y, z = map(float, values)
     if not all(map(isfinite, (x, y, z))):
         raise InputError("A landmark needs three finite coordinates; give a number for each.")
     return x, y, z
 
 
-def _add_point(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
-    name = str(request["name"]).strip()
-    if name in state.point_names:
-        raise InputError(f"There is a landmark {name} already; choose another name.")
-    return f"add the landmark {name}", with_points((name,), {})(state)[1]
-
-
-def _remove_point(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
-    name = request["name"]
-    kept = tuple(mark for mark in state.point_names if mark != name)
-    if kept == state.point_names:
-        raise InputError(f"There is no landmark {str(name)[:_LONGEST_NAME]!r}; reload the page.")
+def _set_point_names(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
+    """Set the names of the landmarks; the points of those that are removed are removed from all scans."""
+    names = tuple(str(name).strip() for name in request["names"])
     specimens = tuple(
-        replace(specimen, points={mark: point for mark, point in specimen.points.items() if mark != name})
+        replace(specimen, points={name: point for name, point in specimen.points.items() if name in names})
         for specimen in state.specimens
     )
-    return f"remove the landmark {name}", replace(state, point_names=kept, specimens=specimens)
+    _, edited = with_points(names, {})(replace(state, point_names=(), specimens=specimens))
+    return "change the names of landmarks", edited
 
 
 def with_points(
@@ -732,10 +747,10 @@ def with_points(
     def change(state: State) -> tuple[str, State]:
         together = tuple(dict.fromkeys((*state.point_names, *names)))
         for name in names:
-            if not name.strip() or name != name.strip() or len(name) > _LONGEST_NAME or not name.isprintable():
-                raise InputError(f"A landmark cannot be called {name[:_LONGEST_NAME]!r}; give it a short name.")
-            if name.startswith("#"):
-                raise InputError(f"A landmark cannot be called {name!r}, as # begins a comment in tables; rename it.")
+            is_comment = name.startswith("#")  # in tables
+            if is_comment or name != name.strip() or not 0 < len(name) <= _LONGEST_NAME or not name.isprintable():
+                shown, most = name[:_LONGEST_NAME], f"{_LONGEST_NAME} characters"
+                raise InputError(f"A landmark cannot be called {shown!r}; give it a name of at most {most} without #.")
         if len(together) > MOST_POINTS:
             raise InputError(f"There would be {len(together)} names of landmarks, and the studio takes {MOST_POINTS}.")
         edited = _edit_specimens(
