@@ -68,7 +68,7 @@
       if (event.key === "Enter") send();
       if (!step || !numbers.every(Number.isFinite)) return;
       event.preventDefault();
-      const next = numbers.map((value, k) => (k === axis ? Number((value + (step * specimen.extent) / STEPS).toPrecision(7)) : value));
+      const next = numbers.map((value, k) => (k === axis ? Number((value + (step * specimen.extent) / STEPS).toPrecision(12)) : value));
       setDraft(next);
       onmove([name, next]);
     };
@@ -101,7 +101,11 @@
     const shown = moving ? { ...points, [moving[0]]: moving[1] } : points;
     const drawn = names.filter((name) => shown[name]);
     const flipped = ([x, y, z]) => [mirrored ? -x : x, y, z];
-    const now = useRef({});
+    const list = useRef(null), now = useRef({});
+    useEffect(() => {
+      const button = list.current?.querySelector("[aria-pressed=true]");
+      if (button) list.current.scrollTop = button.offsetTop - list.current.clientHeight / 2;
+    }, [chosen]);
     now.current = { specimen, chosen, missing, drawn, moving, flipped };
     useEffect(() => {
       view.marks("marks", drawn.map((name) => ({ position: flipped(shown[name]), label: name, colour: name === chosen ? CHOSEN : PLACED })));
@@ -109,7 +113,7 @@
     useEffect(() => {
       if (Studio.state.read_only) return undefined;
       const under = (event) => view.pick(event.clientX, event.clientY, ["scan"]);
-      const of = (hit) => now.current.flipped(hit.point.map((value) => Number(value.toPrecision(7)))); // those of float32
+      const of = (hit) => now.current.flipped(hit.point.map((value) => Number(value.toPrecision(9)))); // the digits of float32
       view.on("click", (event) => {
         const { specimen: one, chosen: name, missing: left } = now.current, hit = under(event);
         if (!hit || !name) return;
@@ -151,7 +155,7 @@
       <section class="scan-marks" aria-label=${M.title} data-testid="marks">
         <h3>${M.title} <span class="hint" data-testid="marks-count">${names.length > 0 && M.of(names.length - missing.length, names.length)}</span></h3>
         ${!Studio.state.read_only && html`<p class="hint" role="status">${!names.length ? M.none : missing.length ? M.hint(chosen) : M.done}</p>`}
-        <div class="mark-names" role="group" aria-label=${M.title}>${names.map((name) => html`<button type="button" key=${name} class=${points[name] ? "placed" : "missing"} aria-pressed=${name === chosen} data-testid=${`mark-${name}`}
+        <div ref=${list} class="mark-names" role="group" aria-label=${M.title}>${names.map((name) => html`<button type="button" key=${name} class=${points[name] ? "placed" : "missing"} aria-pressed=${name === chosen} data-testid=${`mark-${name}`}
           onclick=${() => setChosen(name)}>${name} <small>${points[name] ? M.isPlaced : M.missing}</small></button>`)}</div>
         ${!Studio.state.read_only && html`
           ${chosen && html`<${Coordinates} specimen=${specimen} name=${chosen} onmove=${setMoving} />
