@@ -352,6 +352,7 @@ def test_each_action_is_a_command_line_that_the_parser_takes(project: Project, t
     for k, name in enumerate(("dora", "emil")):
         project.add(tetrahedron(project.new_file(f"{name}.ply"), 5.0 + k), "new")
     join_table(project, b"id,group,age\nanna,a,1\nben,a,2\ncarl,b,3\ndora,a,4\nemil,b,5\n")
+    edit(project, what="points", id="anna", points={"tip": [0, 0, 1]})
     made = (("correspond", "correspondence-1"), ("build", "model-2.h5"), ("fit", "fits-3"), ("compare", "compare-4"))
     done = [
         Job(number=1 + k, kind=one, arguments=(one,), output=output, status="done")

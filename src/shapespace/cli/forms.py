@@ -7,10 +7,12 @@ from typing import Any
 
 from shapespace.cli.options import Option
 from shapespace.formats.registry import MODEL_FORMATS
+from shapespace.io.landmarks.configuration_io import CONFIGURATION_FORMATS, FOLDER_FORMATS
 from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS
 
 _KINDS: Mapping[str, str] = {
     "identify": "recognise identify",
+    "landmarks": "landmarks convert",
     **{test.name: f"test {test.name}" for test in SHAPE_TESTS},
 }
 _FIRST: Mapping[str, tuple[str, ...]] = {
@@ -29,6 +31,7 @@ _FIRST: Mapping[str, tuple[str, ...]] = {
     "identify": ("--subject", "--gallery", "--probe"),
     "convert": ("--to",),
     "export": (),
+    "landmarks": ("--to",),
     "report": (),
     **{
         test.name: (
@@ -44,7 +47,7 @@ _FILES = frozenset(
     for name in (
         "output", "shapes", "model", "table", "labels", "template", "subjects", "add", "redo", "remove", "update",
         "recursive", "dask", "executor", "predictor", "predict", "no-open", "json", "quiet", "all", "groups",
-        "specimens", "surfaces", "set", "orientation",
+        "specimens", "surfaces", "set", "orientation", "sliders", "object", "curve-points", "dimensions",
     )
 )  # fmt: skip
 """Options that the studio sets itself, or that name files."""
@@ -56,6 +59,7 @@ _ACTIONS: Mapping[str, str] = {
     "complete": "Complete partial scans", "compare": "Do groups differ?", "change": "Has it changed?",
     "asymmetry": "Is it symmetric?", "regress": "Shape and a number?", "score": "How unusual is it?",
     "identify": "Who is it?", "report": "Report", "convert": "Convert the model", "export": "Export",
+    "landmarks": "Export landmarks",
     "disparity": "Which group varies more?", "equality": "Do groups differ in mean or variation?",
     "equivalence": "Are groups practically the same?", "power": "How many specimens are needed?",
     "discriminant": "Can groups be distinguished?", "pairwise": "Which pairs of groups differ?",
@@ -124,6 +128,10 @@ def forms(commands: Mapping[str, tuple[str, Sequence[Option]]]) -> dict[str, dic
             **_make_form(kind, *commands[command], first)
         }  # fmt: skip
     made["convert"]["options"][0] |= {"kind": "choice", "choices": list(MODEL_FORMATS)}
+    made["landmarks"]["options"][0] |= {
+        "kind": "choice", "choices": [*CONFIGURATION_FORMATS, *FOLDER_FORMATS], "initial": "csv",
+        "help": "csv has a row for each specimen, long a row for each landmark; the last two are of 3D Slicer",
+    }  # fmt: skip
     made["score"]["options"][0] |= {"kind": "class", "help": "class that the others are compared with"}
     hold = next(option for option in made["regress"]["options"] if option["label"] == _LABELS["hold"])
     hold["help"] = "with --along: class of another column for which shapes are predicted"

@@ -1,4 +1,4 @@
-"""Models with their fits, and surfaces, as applications that send the data of the page; parts that all applications share."""
+"""Models with their fits, and surfaces, as applications that send the data of the page; parts that all share."""
 
 from __future__ import annotations
 

@@ -56,6 +56,8 @@ _HEAD_BYTES = 2**16  # 64 KiB contain the sections before the coordinates
 _TABLES = (".csv", ".txt", ".tsv", ".xlsx")
 _SINGLE = tuple(sorted({*LANDMARK_FORMATS, *READ_ONLY_LANDMARKS} - {".tps"}, key=lambda ending: (-len(ending), ending)))
 _MILLIMETRES = (".mrk.json", ".fcsv")
+CONFIGURATION_ENDINGS = tuple(dict.fromkeys((*_MANY, *_TABLES, *R_ENDINGS, *_SINGLE, *_LINES)))
+"""Endings of the files that `read_configurations` reads."""
 _TPS_KEYS = ("image", "comment")
 """Columns for which TPS has keys."""
 RECORD = "align.json"
@@ -133,7 +135,7 @@ def _read_file(
     suffix = path.suffix.lower()
     single = next((ending for ending in (*_SINGLE, *_LINES) if path.name.lower().endswith(ending)), None)
     if not (suffix in (*_MANY, *_TABLES, *R_ENDINGS) or single):
-        endings = ", ".join(dict.fromkeys((*_MANY, *_TABLES, *R_ENDINGS, *_SINGLE, *_LINES)))
+        endings = ", ".join(CONFIGURATION_ENDINGS)
         raise damage_error(path, f"the ending {suffix!r} is not that of a landmark file ({endings})")
     data = read_bytes(path, LARGEST_CONFIGURATIONS_FILE_BYTES)
     if not data.strip():

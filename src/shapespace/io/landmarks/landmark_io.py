@@ -242,12 +242,16 @@ def write_surface_landmarks(path: Path | str, landmarks: SurfaceLandmarks) -> No
     Raises:
         FileError: the folder cannot be written, or the disk is full.
     """
+    write_text(Path(path), surface_landmarks_text(landmarks))
+
+
+def surface_landmarks_text(landmarks: SurfaceLandmarks) -> str:
+    """Return the content of the file of `write_surface_landmarks`."""
     if landmarks.are_vertices:
-        write_landmark_indices(path, landmarks)
-        return
+        return _indices_text(landmarks)
     columns, cells = surface_landmark_cells(landmarks)
     rows = [[name, *row] for name, row in zip(landmarks.names, cells, strict=True)]
-    write_text(Path(path), rows_text([["name", *columns], *rows]))
+    return rows_text([["name", *columns], *rows])
 
 
 def surface_landmark_cells(landmarks: SurfaceLandmarks) -> tuple[list[str], list[list[str]]]:
@@ -271,7 +275,11 @@ def write_landmark_indices(path: Path | str, indices: Mapping[str, int]) -> None
     Raises:
         FileError: the folder cannot be written, or the disk is full.
     """
-    write_text(Path(path), rows_text([["name", "vertex"], *([k, str(int(v))] for k, v in indices.items())]))
+    write_text(Path(path), _indices_text(indices))
+
+
+def _indices_text(indices: Mapping[str, int]) -> str:
+    return rows_text([["name", "vertex"], *([k, str(int(v))] for k, v in indices.items())])
 
 
 def _format(path: Path, verb: str) -> LandmarkFormat:

@@ -1,4 +1,4 @@
-/* A raw scan in 3-D: its surface from any side, its borders, a scale bar, and what the check found. */
+/* A raw scan in 3-D: its surface from any side, its borders, a scale bar, its landmarks, and what the check found. */
 (function () {
   "use strict";
 
@@ -26,8 +26,165 @@
     bar.textContent = `${length.toLocaleString("en", { maximumSignificantDigits: 2 })} ${unit}`;
   }
 
+  // Landmarks -------------------------------------------------------------------------------------------------------
+
+  const M = S.marks;
+  const AXES = ["x", "y", "z"];
+  const CHOSEN = [0.84, 0.37, 0], PLACED = [0, 0.45, 0.7]; // orange and blue of the figures
+  const STEPS = 500; // of an arrow key along the scan
+
+  const sent = new Map(); // edits on their way: specimen and name -> point
+
+  /** Place a landmark of a specimen, or remove it (null); `seen` is where the user saw it. */
+  async function place({ id, points }, name, point, seen = points[name]) {
+    const key = `${id}/${name}`, before = sent.has(key) ? sent.get(key) : seen || null;
+    sent.set(key, point);
+    await Studio.edit({ what: "points", id, points: { [name]: point }, before: { [name]: before } });
+    if (sent.get(key) === point) sent.delete(key);
+  }
+
+  /** The coordinates of a landmark, which are typed, or moved by the arrow keys until they are released. */
+  function Coordinates({ specimen, name, onmove }) {
+    const point = sent.get(`${specimen.id}/${name}`) || specimen.points[name];
+    const [draft, setDraft] = useState(null);
+    useEffect(() => setDraft(null), [name, String(point)]);
+    const values = draft || point || ["", "", ""];
+    const numbers = values.map((value) => (String(value).trim() ? Number(String(value).replace(",", ".")) : NaN));
+    const send = async () => {
+      if (!draft || !numbers.every(Number.isFinite) || String(numbers) === String(point)) return;
+      setDraft(null);
+      await place(specimen, name, numbers);
+      onmove(null);
+    };
+    const key = (event, axis) => {
+      const step = { ArrowUp: 1, ArrowDown: -1 }[event.key];
+      if (event.key === "Enter") send();
+      if (!step || !numbers.every(Number.isFinite)) return;
+      event.preventDefault();
+      const next = numbers.map((value, k) => (k === axis ? Number((value + (step * specimen.extent) / STEPS).toPrecision(12)) : value));
+      setDraft(next);
+      onmove([name, next]);
+    };
+    return html`<fieldset class="choices coordinates" data-testid="coordinates"><legend>${M.coordinates(name)}</legend>
+      ${AXES.map((axis, k) => html`<label>${axis} <input inputmode="decimal" size="9" data-testid=${`mark-${axis}`} aria-label=${M.axis(axis, name)} value=${values[k]} onkeydown=${(event) => key(event, k)}
+        onkeyup=${(event) => { if (event.key.startsWith("Arrow")) send(); }} oninput=${(event) => setDraft(values.map((value, other) => (other === k ? event.target.value : value)))} onblur=${send} /></label>`)}
+      <small class="hint">${M.file}</small></fieldset>`;
+  }
+
+  const setNames = (names) => Studio.edit({ what: "point-names", names });
+
+  /** A form that adds the name of a landmark. */
+  function AddName({ onadd }) {
+    const [name, setName] = useState("");
+    const add = async (event) => {
+      event.preventDefault();
+      if (await setNames([...Studio.state.project.point_names, name])) { onadd(name.trim()); setName(""); }
+    };
+    return html`<form class="row" onsubmit=${add}><input required size="14" aria-label=${M.name} placeholder=${M.name} data-testid="mark-name" value=${name} oninput=${(event) => setName(event.target.value)} />
+      <button class="small" data-testid="mark-add" disabled=${!name.trim()}>${M.add}</button></form>`;
+  }
+
+  /** Landmarks of a scan: those of the project by name, in the view and as coordinates. `mirrored`: as the view shows it. */
+  function Landmarks({ specimen, view, box, mirrored }) {
+    const { point_names: names, undo } = Studio.state.project, { points } = specimen;
+    const [wanted, setChosen] = useState(null);
+    const [moving, setMoving] = useState(null); // [name, point] while it is dragged
+    const missing = names.filter((name) => !points[name]);
+    const chosen = names.includes(wanted) ? wanted : missing[0] || names[0];
+    const shown = moving ? { ...points, [moving[0]]: moving[1] } : points;
+    const drawn = names.filter((name) => shown[name]);
+    const flipped = ([x, y, z]) => [mirrored ? -x : x, y, z];
+    const list = useRef(null), now = useRef({});
+    useEffect(() => {
+      const button = list.current?.querySelector("[aria-pressed=true]");
+      if (button) list.current.scrollTop = button.offsetTop - list.current.clientHeight / 2;
+    }, [chosen]);
+    now.current = { specimen, chosen, missing, drawn, moving, flipped };
+    useEffect(() => {
+      view.marks("marks", drawn.map((name) => ({ position: flipped(shown[name]), label: name, colour: name === chosen ? CHOSEN : PLACED })));
+    }, [view, chosen, JSON.stringify(shown), names]);
+    useEffect(() => {
+      if (Studio.state.read_only) return undefined;
+      const under = (event) => view.pick(event.clientX, event.clientY, ["scan"]);
+      const of = (hit) => now.current.flipped(hit.point.map((value) => Number(value.toPrecision(9)))); // the digits of float32
+      view.on("click", (event) => {
+        const { specimen: one, chosen: name, missing: left } = now.current, hit = under(event);
+        if (!hit || !name) return;
+        if (left.includes(name)) setChosen(left[left.indexOf(name) + 1] || left.find((other) => other !== name) || name);
+        place(one, name, of(hit));
+      });
+      let taken = null;
+      const listeners = {
+        pointerdown: (event) => {
+          const hit = event.button === 0 && view.has("marks") && view.pick(event.clientX, event.clientY, ["marks", "scan"]);
+          if (!hit || hit.id !== "marks") return;
+          event.stopPropagation(); // the scan does not turn
+          const name = now.current.drawn[hit.vertex];
+          taken = { name, seen: now.current.specimen.points[name] };
+          setChosen(name);
+          box.setPointerCapture(event.pointerId);
+        },
+        pointermove: (event) => {
+          if (!taken) return;
+          event.stopPropagation();
+          const hit = under(event);
+          if (hit) setMoving([taken.name, of(hit)]);
+        },
+        pointerup: async (event) => {
+          if (!taken) return;
+          event.stopPropagation();
+          const { name, seen } = taken, { moving: moved } = now.current;
+          taken = null;
+          if (moved && event.type === "pointerup") await place(now.current.specimen, name, moved[1], seen);
+          setMoving(null);
+        },
+      };
+      listeners.pointercancel = listeners.pointerup;
+      for (const [kind, listener] of Object.entries(listeners)) box.addEventListener(kind, listener, true);
+      return () => { for (const [kind, listener] of Object.entries(listeners)) box.removeEventListener(kind, listener, true); };
+    }, [view]);
+    if (Studio.state.read_only && !names.length) return null;
+    return html`
+      <section class="scan-marks" aria-label=${M.title} data-testid="marks">
+        <h3>${M.title} <span class="hint" data-testid="marks-count">${names.length > 0 && M.of(names.length - missing.length, names.length)}</span></h3>
+        ${!Studio.state.read_only && html`<p class="hint" role="status">${!names.length ? M.none : missing.length ? M.hint(chosen) : M.done}</p>`}
+        <div ref=${list} class="mark-names" role="group" aria-label=${M.title}>${names.map((name) => html`<button type="button" key=${name} class=${points[name] ? "placed" : "missing"} aria-pressed=${name === chosen} data-testid=${`mark-${name}`}
+          onclick=${() => setChosen(name)}>${name} <small>${points[name] ? M.isPlaced : M.missing}</small></button>`)}</div>
+        ${!Studio.state.read_only && html`
+          ${chosen && html`<${Coordinates} specimen=${specimen} name=${chosen} onmove=${setMoving} />
+            <div class="row"><${Button} small testid="mark-remove" disabled=${!points[chosen]} aria-label=${M.removeOf(chosen)} onclick=${() => place(specimen, chosen, null)}>${M.remove}<//>
+              <${Button} small testid="mark-undo" disabled=${!undo} title=${undo ? S.undoOf(undo) : S.undo} onclick=${Studio.undo}>${S.undo}<//></div>`}
+          <${AddName} onadd=${setChosen} />`}
+      </section>`;
+  }
+
+  /** The landmarks of the project: on how many scans each is placed, and their export. */
+  Studio.ManageLandmarks = function ManageLandmarks({ project }) {
+    const [open, setOpen] = useState(false);
+    const { point_names: names, specimens } = project;
+    if (!names.length) return null;
+    const done = Studio.newest("landmarks");
+    return html`<${Button} testid="landmarks-all" onclick=${() => setOpen(true)}>${M.manage}<//>
+      ${open && html`
+        <${Dialog} title=${M.title} testid="landmarks-dialog" onclose=${() => setOpen(false)} wide>
+          <p class="hint">${M.intro}</p>
+          <div class="table-box preview" role="region" aria-label=${M.title} tabindex="0"><table class="plain">
+            <thead><tr><th scope="col">${M.title}</th><th scope="col">${M.specimens}</th><th scope="col"><span class="hidden">${S.remove}</span></th></tr></thead>
+            <tbody>${names.map((name) => html`<tr key=${name}><th scope="row">${name}</th><td>${M.of(specimens.filter((one) => one.points[name]).length, specimens.length)}</td>
+              <td><${Button} edits small class="quiet" aria-label=${M.removeAll(name)} testid=${`landmark-remove-${name}`} onclick=${() => setNames(names.filter((other) => other !== name))}>×<//></td></tr>`)}</tbody></table></div>
+          ${!Studio.state.read_only && html`<${Studio.JobForm} kind="landmarks" label=${Studio.action("landmarks")} />`}
+          <${Studio.Jobs} kinds=${["landmarks"]} />
+          ${done && html`<${Studio.Outdated} job=${done} />`}
+          <div class="row end">${done && html`<a class="button" href=${/[.]/.test(done.output) ? Studio.fileAddress(done.output) : `/zip/${done.number}`} download data-testid="landmarks-download">${M.download}</a>`}
+            <${Button} testid="landmarks-close" onclick=${() => setOpen(false)}>${window.ShapespaceTexts.close}<//></div>
+        <//>`}`;
+  };
+
+  // The view --------------------------------------------------------------------------------------------------------
+
   Studio.Scan = function Scan({ specimen, onclose }) {
     const box = useRef(null), bar = useRef(null), view = useRef(null);
+    const mirrored = useRef(specimen.mirrored).current; // as the surface that is read
     const [state, setState] = useState(S.scan.reading);
     const [borders, setBorders] = useState(0);
     useEffect(() => {
@@ -56,7 +213,8 @@
       <${Dialog} title=${specimen.id} testid="scan" onclose=${onclose} wide>
         <div class="row" role="group" aria-label=${S.scan.sides}>${Object.keys(SIDES).map((side) => html`<${Button} small testid=${`scan-${side}`} onclick=${() => turn(side)}>${S.scan[side]}<//>`)}
           <span class="grow"></span><${Button} small testid="scan-close" onclick=${onclose}>${window.ShapespaceTexts.close}<//></div>
-        <div class="scan-view"><div ref=${box} class="canvas" data-testid="scan-view" data-ready=${state === ""}></div><p class="hint" role="status">${state}</p><span ref=${bar} class="scale-bar" data-testid="scan-scale"></span></div>
+        <div class="scan-body"><div class="scan-view"><div ref=${box} class="canvas" data-testid="scan-view" data-ready=${state === ""}></div><p class="hint" role="status">${state}</p><span ref=${bar} class="scale-bar" data-testid="scan-scale"></span></div>
+          ${state === "" && html`<${Landmarks} specimen=${specimen} view=${view.current} box=${box.current} mirrored=${mirrored} />`}</div>
         <p class="hint">${S.scan.axes}${borders ? ` ${S.scan.borders}` : ""}</p>
         <${Studio.Findings} specimen=${specimen} />
       <//>`;

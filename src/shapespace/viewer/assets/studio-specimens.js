@@ -15,6 +15,9 @@
   Studio.Include = ({ specimen, label }) => html`<label class="include"><input type="checkbox" checked=${specimen.included} aria-label=${S.includeOne(specimen.id)} data-testid=${`include-${specimen.id}`}
     disabled=${specimen.state === "unusable" || Studio.state.read_only} onchange=${(event) => include(specimen, event.target)} />${label && html`<span aria-hidden="true">${label}</span>`}</label>`;
 
+  /** The number of landmarks that are placed on a scan. */
+  Studio.placed = (specimen) => Object.keys(specimen.points).length;
+
   /** A button that opens a scan in 3-D. */
   Studio.ShowScan = function ShowScan({ specimen }) {
     const [open, setOpen] = useState(false);
@@ -46,7 +49,7 @@
     return JSON.stringify(columns.map(([column, classes], k) => [column, specimen.cells[column] || "", k ? "" : COLOURS[Object.keys(classes).filter(Boolean).sort().indexOf(specimen.cells[column])] || ""]).filter(([, name]) => name));
   }
 
-  function Card({ specimen, groups, selected, onselect }) {
+  function Card({ specimen, groups, names, selected, onselect }) {
     return useMemo(() => html`
       <li class=${`card ${specimen.included ? "" : "excluded"}`} data-testid=${`card-${specimen.id}`} data-state=${specimen.state}>
         <button type="button" class="picture" aria-pressed=${selected} data-testid=${`select-${specimen.id}`} onclick=${(event) => onselect(specimen.id, event)}>
@@ -58,8 +61,9 @@
         <div class="row"><${Studio.Include} specimen=${specimen} /><strong title=${specimen.id}>${specimen.id}</strong><${Studio.ShowScan} specimen=${specimen} />${specimen.set === "new" && html`<span class="tag">${S.new}</span>`}
           ${specimen.mirrored && html`<span class="tag">${S.mirrored}</span>`}${specimen.unit && html`<span class="tag">${S.unit(specimen.unit)}</span>`}</div>
         ${groups !== "[]" && html`<div class="row">${JSON.parse(groups).map(([column, name, colour]) => html`<span class="tag group" title=${`${column}: ${name}`}>${colour && html`<i style=${{ background: colour }}></i>`}${name}</span>`)}</div>`}
+        ${Studio.placed(specimen) > 0 && html`<p class="finding" data-testid=${`placed-${specimen.id}`}>${S.marks.placed(Studio.placed(specimen), names.length)}</p>`}
         <${Studio.Findings} specimen=${specimen} />
-      </li>`, [specimen, groups, selected, onselect]);
+      </li>`, [specimen, groups, names, selected, onselect]);
   }
 
   /** Notes on the table, and the number of specimens of each class. */
@@ -101,6 +105,7 @@
       <${FileButton} folder label=${S.chooseFolder} testid="choose-folder" onfiles=${add} />
       <${Button} testid="add-here" onclick=${() => setBrowsing(true)}>${S.addHere}<//>
       ${table && html`<${FileButton} label=${S.importTable} testid="import-table" accept=".csv,.tsv,.xlsx" onfiles=${add} />`}
+      ${table && html`<${FileButton} label=${S.importLandmarks} testid="import-landmarks" onfiles=${(files) => Studio.upload(files, set, "landmarks")} />`}
       ${browsing && html`<${AddFromHere} set=${set} onclose=${() => setBrowsing(false)} />`}`;
   });
 
@@ -204,12 +209,13 @@
           <label class="filter">${S.filter} <input type="search" placeholder=${S.filterHint} data-testid="filter" value=${filter} oninput=${(event) => setFilter(event.target.value)} /></label>
           <${Button} edits testid="undo" disabled=${!project.undo || Studio.uploading()} title=${project.undo ? S.undoOf(project.undo) : S.undo} onclick=${Studio.undo}>${S.undo}<//>
           <${Button} edits testid="redo" disabled=${!project.redo || Studio.uploading()} title=${project.redo ? S.redoOf(project.redo) : S.redo} onclick=${Studio.redo}>${S.redo}<//>
+          <${Studio.ManageLandmarks} project=${project} />
           ${layout === "table" ? html`<${Studio.AddColumn} />` : html`<${Button} testid="select-all" onclick=${selectAll}>${all ? S.clear : S.selectAll}<//>`}
           ${selected.length > 0 && html`<${Studio.SelectionBar} selected=${selected} onclear=${() => setSelection(new Set())} />`}
         </div>
         ${!listed.length && html`<p class="hint">${S.nothing}</p>`}
         ${layout === "cards"
-          ? html`<ul class="cards" data-testid="cards">${shown.map((one) => html`<${Card} key=${one.id} specimen=${one} groups=${groupsOf(one, project.counts)} selected=${selection.has(one.id)} onselect=${select} />`)}</ul>`
+          ? html`<ul class="cards" data-testid="cards">${shown.map((one) => html`<${Card} key=${one.id} specimen=${one} groups=${groupsOf(one, project.counts)} names=${project.point_names} selected=${selection.has(one.id)} onselect=${select} />`)}</ul>`
           : html`<${Studio.Table} listed=${listed} shown=${shown} columns=${project.columns} selection=${selection} onselect=${select} onselectall=${selectAll} />`}
         ${listed.length > limit && html`<${Button} class="more" testid="show-more" onclick=${() => setLimit(limit + SHOWN)}>${S.more(Math.min(SHOWN, listed.length - limit))}<//>`}
       <//>`;

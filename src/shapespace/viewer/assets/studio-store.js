@@ -71,7 +71,7 @@
       const old = known.get(specimen.id);
       return old && JSON.stringify(old) === JSON.stringify(specimen) ? old : specimen;
     });
-    if (JSON.stringify(before.columns) === JSON.stringify(state.project.columns)) state.project.columns = before.columns;
+    for (const key of ["columns", "point_names"]) if (JSON.stringify(before[key]) === JSON.stringify(state.project[key])) state.project[key] = before[key];
   }
 
   function listen() {
@@ -163,12 +163,14 @@
   const waiting = [];
   let workers = 0;
 
-  /** Add scans, three at a time; tables follow, as their rows name the scans. */
-  function upload(files, set) {
+  /** Add scans, three at a time; tables and landmarks follow, as they name the scans. `only`: the kind of all files. */
+  function upload(files, set, only) {
     if (!uploading()) Studio.uploads = { total: 0, done: 0, added: 0, notes: [] };
     files.sort((a, b) => byName(a.name, b.name));
-    const tables = files.filter((file) => ending(file.name, TABLES));
-    for (const file of files.filter((one) => !tables.includes(one)).concat(tables)) waiting.push([file, set, tables.includes(file)]);
+    const { formats, landmark_formats: ofLandmarks } = Studio.state;
+    const kindOf = ({ name }) => only || (ending(name, TABLES) ? "table" : !ending(name, formats) && ending(name, ofLandmarks) ? "landmarks" : "");
+    const all = files.map((file) => [file, set, kindOf(file)]);
+    waiting.push(...all.filter(([, , kind]) => !kind), ...all.filter(([, , kind]) => kind));
     Studio.uploads.total += files.length;
     Studio.changed();
     for (let k = workers; k < UPLOADS_AT_ONCE && waiting.length; k++) work();
@@ -177,9 +179,9 @@
   async function work() {
     workers += 1;
     while (waiting.length && !(waiting[0][2] && workers > 1)) {
-      const [file, set, isTable] = waiting.shift();
+      const [file, set, kind] = waiting.shift();
       try {
-        if (isTable) await importTable(file);
+        if (kind) await importTable(file, kind);
         else await uploadScan(file, set);
       } catch (error) {
         Studio.uploads.notes.push(error.message.includes(file.name) ? error.message : `${file.name}: ${error.message}`);
@@ -202,9 +204,9 @@
     else Studio.uploads.added += 1;
   }
 
-  async function importTable(file) {
-    const { matched, notes } = await json(`/api/table?name=${encodeURIComponent(file.name)}`, { method: "POST", body: file });
-    Studio.uploads.notes.push(T.uploads.table(file.name, matched), ...notes);
+  async function importTable(file, kind) {
+    const { matched, landmarks, notes } = await json(`/api/table?name=${encodeURIComponent(file.name)}&kind=${kind}`, { method: "POST", body: file });
+    Studio.uploads.notes.push(landmarks ? T.uploads.landmarks(file.name, landmarks, matched) : T.uploads.table(file.name, matched), ...notes);
   }
 
   // What the screens ask of the state -------------------------------------------------------------------------------

@@ -76,7 +76,7 @@
   const setUnit = (specimen, select) => Studio.editBy({ what: "unit", ids: [specimen.id], unit: select.value }, () => { select.value = specimen.unit; });
   const setMirror = (specimen, box) => Studio.editBy({ what: "mirror", ids: [specimen.id], mirrored: box.checked }, () => { box.checked = specimen.mirrored; });
 
-  function Row({ specimen, row, columns, selected, onselect, onblock }) {
+  function Row({ specimen, row, columns, names, selected, onselect, onblock }) {
     // Unchanged rows are not compared again; the state keeps unchanged specimens.
     return useMemo(() => html`
       <tr class=${`${specimen.included ? "" : "excluded"} ${selected ? "selected" : ""}`} data-testid=${`row-${specimen.id}`}>
@@ -89,11 +89,12 @@
         <td>${specimen.set === "new" ? S.new : S.training}</td>
         <td><${Studio.Unit} aria-label=${S.unitOf(specimen.id)} data-testid=${`unit-${specimen.id}`} disabled=${Studio.state.read_only} value=${specimen.unit} onunit=${(select) => setUnit(specimen, select)} /></td>
         <td class="tick"><input type="checkbox" checked=${specimen.mirrored} aria-label=${S.mirrorOne(specimen.id)} data-testid=${`mirror-${specimen.id}`} disabled=${Studio.state.read_only} onchange=${(event) => setMirror(specimen, event.target)} /></td>
+        ${names.length > 0 && html`<td class="number" data-testid=${`placed-${specimen.id}`}>${Studio.placed(specimen) || ""}</td>`}
         <td class="number">${specimen.extent ? specimen.extent.toLocaleString("en", { maximumSignificantDigits: 3 }) : ""}</td>
         <td class="number">${specimen.triangles ? specimen.triangles.toLocaleString("en") : ""}</td>
         <td><${Studio.ShowScan} specimen=${specimen} /></td>
         <td class="findings"><${Studio.Findings} specimen=${specimen} /></td>
-      </tr>`, [specimen, row, columns, selected, onselect, onblock]);
+      </tr>`, [specimen, row, columns, names, selected, onselect, onblock]);
   }
 
   function AddColumn() {
@@ -131,6 +132,7 @@
 
   /** A table of `listed`; pasted blocks go on to specimens that are not shown yet. */
   Studio.Table = function Table({ listed, shown, columns, selection, onselect, onselectall }) {
+    const { point_names: names } = Studio.state.project;
     const [removing, setRemoving] = useState(null);
     const [pasting, setPasting] = useState(null);
     const order = useRef(listed);
@@ -153,9 +155,9 @@
             ${columns.map((name) => html`<th scope="col" key=${name}><span class="head">${name}
               <${Button} edits small class="quiet" aria-label=${S.removeColumn(name)} testid=${`remove-column-${name}`} onclick=${() => setRemoving(name)}>×<//></span></th>`)}
             <th scope="col">${S.columns.set}</th><th scope="col">${S.columns.unit}</th><th scope="col">${S.columns.mirror}</th>
-            <th scope="col" class="number">${S.columns.extent}</th><th scope="col" class="number">${S.columns.size}</th><th scope="col">${S.scan.open}</th><th scope="col">${S.columns.findings}</th>
+            ${names.length > 0 && html`<th scope="col" class="number">${S.marks.title}</th>`}<th scope="col" class="number">${S.columns.extent}</th><th scope="col" class="number">${S.columns.size}</th><th scope="col">${S.scan.open}</th><th scope="col">${S.columns.findings}</th>
           </tr></thead>
-          <tbody>${shown.map((specimen, row) => html`<${Row} key=${specimen.id} specimen=${specimen} row=${row} columns=${columns} selected=${selection.has(specimen.id)} onselect=${onselect} onblock=${onblock} />`)}</tbody>
+          <tbody>${shown.map((specimen, row) => html`<${Row} key=${specimen.id} specimen=${specimen} row=${row} columns=${columns} names=${names} selected=${selection.has(specimen.id)} onselect=${onselect} onblock=${onblock} />`)}</tbody>
         </table>
       </div>
       ${pasting !== null && html`<${Preview} match=${pasting} onclose=${() => setPasting(null)} />`}

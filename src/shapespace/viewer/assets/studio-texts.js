@@ -31,8 +31,8 @@
     },
 
     specimens: {
-      dropTitle: "Drop scans or folders here", dropHint: (formats) => `Mesh and point cloud files (${formats}), and a table (CSV or XLSX) with their data.`,
-      chooseFiles: "Choose files", chooseFolder: "Choose a folder", addHere: "Add from this machine", importTable: "Import a table",
+      dropTitle: "Drop scans or folders here", dropHint: (formats) => `Mesh and point cloud files (${formats}), a table (CSV or XLSX) with their data, and files of landmarks.`,
+      chooseFiles: "Choose files", chooseFolder: "Choose a folder", addHere: "Add from this machine", importTable: "Import a table", importLandmarks: "Import landmarks",
       addTitle: "Add scans from this machine", byReference: "Refer to the files where they are", byCopy: "Copy the files into the project",
       addFolder: "Add this folder", added: (number) => `${count(number, "scan")} added.`,
       cards: "Cards", table: "Table", layout: "Layout", filter: "Filter", filterHint: "name, class or finding",
@@ -54,6 +54,13 @@
         front: "Front", back: "Back", left: "Left", right: "Right", top: "Top", bottom: "Bottom", units: "units of the file",
         axes: "The axes are those of the file: front looks along -z, with y up. Drag to turn, scroll to zoom.", borders: "Red: borders of holes.",
       },
+      marks: {
+        title: "Landmarks", manage: "Landmarks", placed: (number, all) => `${number} of ${all} landmarks`, of: (number, all) => `${number} of ${all} placed`, missing: "missing", isPlaced: "placed",
+        hint: (name) => `Click ${name} on the scan, or type its coordinates. Drag a landmark to move it.`, done: "All landmarks are placed. Drag one to move it.", none: "Name a landmark, then click its place on the scan.",
+        name: "New landmark", add: "Add", coordinates: (name) => `Coordinates of ${name}`, axis: (axis, name) => `${axis} of ${name}`, file: "In the unit and axes of the file; arrow keys move it in small steps.",
+        remove: "Remove from this scan", removeOf: (name) => `Remove ${name} from this scan`, removeAll: (name) => `Remove the landmark ${name} from all scans`, specimens: "Specimens",
+        intro: "Correspondence, and fits by a model with the same landmarks, use the landmarks of scans. An export has them in the unit and axes of each scan.", download: "Download",
+      },
       paste: {
         title: (number) => `Paste the cells of ${count(number, "specimen")}?`, action: "Paste",
         byName: "Each row goes to the specimen that it names.",
@@ -70,6 +77,7 @@
       progress: (done, total) => `Adding file ${Math.min(done + 1, total)} of ${total}`, finished: (added) => `${count(added, "file")} added.`,
       leftOut: (number) => `${count(number, "file")} not added`, tooLarge: (name, limit) => `${name} is larger than ${limit} MB; add it from this machine instead.`,
       format: (name) => `${name} is not a scan in a format that can be read.`, same: (name, other) => `${name} has the same content as ${other}.`,
+      landmarks: (name, number, matched) => `${name}: ${count(number, "landmark")} of ${count(matched, "specimen")} read.`,
       table: (name, matched) => `${name}: cells of ${count(matched, "specimen")} read.`, dismiss: "Close the list",
     },
 

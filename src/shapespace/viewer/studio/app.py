@@ -24,6 +24,7 @@ from shapespace.batch.result_folder import LOCK, only_writer
 from shapespace.errors import FileError, InputError
 from shapespace.io.containers.json_files import plain_json
 from shapespace.io.files import atomic_path
+from shapespace.io.landmarks.configuration_io import CONFIGURATION_ENDINGS
 from shapespace.io.meshes.mesh_io import MESH_ENDINGS, MESH_FILE_ENDINGS
 from shapespace.schemas import read
 from shapespace.types import MM_PER_UNIT
@@ -52,6 +53,7 @@ from shapespace.viewer.studio.job_commands import (
     shapes_of,
 )
 from shapespace.viewer.studio.jobs import Job, Jobs, Order, history
+from shapespace.viewer.studio.landmark_import import is_landmark_table, points_of_file
 from shapespace.viewer.studio.project import (
     PastedBlock,
     Project,
@@ -61,6 +63,7 @@ from shapespace.viewer.studio.project import (
     change_of,
     recent_projects,
     with_cells,
+    with_points,
 )
 from shapespace.viewer.studio.specimen_checks import SpecimenChecks
 from shapespace.viewer.studio.views import Views, result_path, view_kinds
@@ -121,14 +124,15 @@ class OpenProject:
             }  # fmt: skip
             specimens.append({
                 "id": specimen.id, "file": specimen.file, "set": specimen.role, "included": specimen.included,
-                "unit": specimen.unit, "mirrored": specimen.mirrored, "cells": specimen.cells, **facts,
+                "unit": specimen.unit, "mirrored": specimen.mirrored, "cells": specimen.cells,
+                "points": specimen.points, **facts,
                 "findings": [{**finding, "text": self._sentence(finding["text"])} for finding in facts["findings"]],
             })  # fmt: skip
         return {
             "name": state.name, "folder": str(project.folder), "revision": project.revision,
             "columns": list(state.columns), "specimens": specimens, "notes": state.notes(), "counts": state.counts(),
             "undo": project.undo_text, "redo": project.redo_text, "landmarks": state.landmarks,
-            "landmarks_on": state.landmarks_on,
+            "landmarks_on": state.landmarks_on, "point_names": list(state.point_names),
             "jobs": [self._job(job) for job in jobs],
         }  # fmt: skip
 
@@ -268,6 +272,7 @@ class Studio:
             {
                 "version": __version__, "project": None if self._open is None else self._open.facts(),
                 "recent": recent_projects(), "formats": list(MESH_ENDINGS), "upload_bytes": self._upload_bytes,
+                "landmark_formats": list(CONFIGURATION_ENDINGS),
                 "units": list(MM_PER_UNIT), "read_only": self._read_only,
             }
         )  # fmt: skip
@@ -361,11 +366,21 @@ class Studio:
     async def _table(self, request: Request) -> Response:
         content = await whole_body(request, _TABLE_BYTES, "The table is too large.")
         project = self._project.project
-        name = request.query_params.get("name", "")[:100] or "The table"
+        name = display_name(request.query_params.get("name", "The table"))
+        as_landmarks = request.query_params.get("kind") == "landmarks"
+        if as_landmarks or await run_in_threadpool(is_landmark_table, content, name, project.state):
+            return await self._take_landmarks(content, name)
         columns, cells, notes = await run_in_threadpool(cells_of_table, content, project.state, name)
         await run_in_threadpool(project.edit, None, with_cells(columns, cells))
         self._changed()
         return json_response({"matched": len(cells), "notes": [*notes, *project.state.notes()]})
+
+    async def _take_landmarks(self, content: bytes, name: str) -> Response:
+        project = self._project.project
+        names, points, notes = await run_in_threadpool(points_of_file, content, name, project.state)
+        await run_in_threadpool(project.edit, None, with_points(names, points), together="import landmarks")
+        self._changed()
+        return json_response({"matched": len(points), "landmarks": len(names), "notes": notes})
 
     async def _match_block(self, request: Request) -> Response:
         content = await json_body(request, _TABLE_BYTES)

@@ -7,17 +7,21 @@ import csv
 import io
 import re
 from collections.abc import Collection, Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
 from typing import Any, Literal
 
 from shapespace.cohort.read import cohort_file_text
 from shapespace.cohort.table import Table, is_number, list_names
-from shapespace.errors import InputError, ShapespaceError
+from shapespace.errors import FileError, InputError, ShapespaceError
+from shapespace.io.landmarks.configuration_io import CONFIGURATION_FORMATS
 from shapespace.io.tables.table_io import DECIMAL_COMMA
+from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import CorrespondRecord
 from shapespace.statistics.compare_formula import design_of
 from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS
 from shapespace.viewer.studio.jobs import Job, Order
-from shapespace.viewer.studio.project import Project, Specimen
+from shapespace.viewer.studio.project import LANDMARK_COLUMN, Project, Specimen
 
 Forms = Mapping[str, Mapping[str, Any]]
 """Kind -> `command` (its words), `label`, `summary`, and `options`, each with `flag`, `argument`, `label`, `help`,
@@ -114,15 +118,17 @@ def order(
     state, listed = project.state, f"{stem}.csv"
     if kind == "correspond":
         chosen = _require_specimens(state.chosen("training"), "to bring into correspondence", 2)
-        content, prepared = project.scan_list(folder / listed, chosen)
+        files, prepared = project.scan_list(folder / listed, chosen)
         output = f"correspondence-{number}"
-        return Order((*words, listed, "-o", output, *given), output, prepared, files={listed: content})
+        return Order((*words, listed, "-o", output, *given), output, prepared, files=files)
     if kind == "redo":
         before = result_of(jobs, CORRESPONDENCES, on)
         name = str(options.get("name", ""))
-        if name not in {specimen.id for specimen in state.specimens}:
+        chosen = [specimen for specimen in state.specimens if specimen.id == name]
+        if not chosen:
             raise InputError(f"There is no specimen {name[:40]!r}; choose one of the list.")
-        return Order((*words, "--redo", name, "-o", before.output), before.output)
+        files, prepared = project.scan_list(folder / listed, chosen)
+        return Order((*words, listed, "--redo", name, "-o", before.output), before.output, prepared, files=files)
     if kind == "build":
         before = result_of(jobs, CORRESPONDENCES, on)
         output = f"model-{number}.h5"
@@ -133,7 +139,7 @@ def order(
                     f"The landmarks were placed on {state.landmarks_on}; place them on {before.output}, or remove them."
                 )
             marks = ("--landmarks", f"{stem}-landmarks.csv")
-            files[marks[1]] = project.landmark_table()
+            files[marks[1]] = project.landmark_table(before.output)
         return Order((*words, *_surfaces(project, before), "-o", output, *marks, *given), output, files=files)
     if kind == "quality":
         output = f"quality-{number}"
@@ -141,9 +147,13 @@ def order(
     if kind in ("fit", "complete"):
         model = result_of(jobs, ("build",), on).output
         chosen = _require_specimens(state.chosen("new"), "to fit; drop new scans", 1)
-        content, prepared = project.scan_list(folder / listed, chosen)
+        has_points, path = any(specimen.points for specimen in chosen), folder / model
+        names = _landmark_names(path, path.stat().st_mtime if path.is_file() else 0.0) if has_points else ()
+        files, prepared = project.scan_list(folder / listed, chosen, names)
         output = f"{'fits' if kind == 'fit' else 'completed'}-{number}"
-        return Order((*words, model, listed, "-o", output, *given), output, prepared, files={listed: content})
+        return Order((*words, model, listed, "-o", output, *given), output, prepared, files=files)
+    if kind == "landmarks":
+        return _export_landmarks(project, words, given, str(options.get("--to", "")), number)
     if kind == "report" and on is None:
         output = f"report-{number}/report.html"
         results = [job.output for job in _results_of_study(jobs)]
@@ -165,6 +175,28 @@ def order(
     if kind not in QUESTIONS:
         raise InputError(f"There is no action {kind[:30]!r}; reload the page.")
     return _question(project, jobs, kind, words, given, options, on, number)
+
+
+def _export_landmarks(project: Project, words: tuple[str, ...], given: Sequence[str], to: str, number: int) -> Order:
+    """Return the command that writes the landmarks of the included scans."""
+    included = (*project.state.chosen("training"), *project.state.chosen("new"))
+    marked = [specimen for specimen in included if specimen.points]
+    if not marked:
+        raise InputError("No included specimen has landmarks; place some on a scan, or import a file of landmarks.")
+    listed, output = f"{_INPUTS}/{number:04d}-landmarks.csv", f"landmarks-{number}{CONFIGURATION_FORMATS.get(to, '')}"
+    return Order((*words, listed, "-o", output, *given), output, files={listed: project.point_table(marked)})
+
+
+@lru_cache(maxsize=8)
+def _landmark_names(model: Path, modified_s: float) -> frozenset[str]:
+    """Return the names of the landmarks of the model that was written at a time; the page asks again and again.
+
+    A model that cannot be read, which its command reports, has none.
+    """
+    try:
+        return frozenset(ShapeModel.load(model).landmarks)
+    except ShapespaceError:
+        return frozenset()
 
 
 def _question(
@@ -353,7 +385,7 @@ def outdated_results(project: Project, jobs: Sequence[Job], forms: Forms) -> dic
         sources = [other for other in earlier if _reads(job, other.output)]
         redone = [other.output for other in done if other.kind == "redo" and other.number > job.number]
         if (
-            job.kind in (*_STUDY, "report")
+            job.kind in (*_STUDY, "report", "landmarks")
             and not (job.kind == "redo" or (job.kind == "report" and "--specimens" not in job.arguments))
             and (change := _change_since(project, earlier, forms, job, sources))
         ):
@@ -375,7 +407,7 @@ def _change_since(
     on = job.on if job.on is not None or not sources or job.kind == "report" else sources[-1].number
     try:
         now = order(project, earlier, forms, job.kind, job.options, on, job.number)
-    except InputError:
+    except (InputError, FileError):
         moved = job.kind == "build" and bool(sources) and project.state.landmarks_on not in ("", sources[-1].output)
         return "landmarks" if moved else "specimens"
     is_each = job.kind in ("correspond", "fit", "complete")  # each scan has a result, also if others are excluded later
@@ -387,18 +419,28 @@ def _change_since(
             before = (project.folder / name).read_text(encoding="utf-8")
         except OSError:
             continue  # the file was removed, so there is nothing to compare
-        if name.endswith("-landmarks.csv"):
+        if name.startswith(f"{_INPUTS}/{job.number:04d}-landmarks"):
             if content != before:
+                return "landmarks"
+        elif is_each:
+            if _cells_of(content, "file") - _cells_of(before, "file"):
+                return "specimens"
+            if _cells_of(content, LANDMARK_COLUMN) - _cells_of(before, LANDMARK_COLUMN):
                 return "landmarks"
         elif name.endswith(".csv"):
             columns = {*project.state.columns, *next(csv.reader(io.StringIO(before)))}
-            used = {"id", "file"} if is_each else {"specimen", "subject", *_used_columns(sorted(columns), job.options)}
+            used = {"specimen", "subject", *_used_columns(sorted(columns), job.options)}
             used = columns if job.kind == "report" else used
             rows, rows_before = _rows_of(content, used), _rows_of(before, used)
-            if rows != rows_before and not (is_each and all(row in rows_before for row in rows)):
-                is_same = not is_each and [row[:1] for row in rows] == [row[:1] for row in rows_before]
+            if rows != rows_before:
+                is_same = [row[:1] for row in rows] == [row[:1] for row in rows_before]
                 return "table" if is_same else "specimens"
     return None
+
+
+def _cells_of(scans: str, column: str) -> set[tuple[str, str]]:
+    """Return the ids and the cells of a column of a list of scans; cells of a column that it lacks are empty."""
+    return {(row["id"], row.get(column, "")) for row in csv.DictReader(io.StringIO(scans))}
 
 
 def _rows_of(table: str, columns: Collection[str]) -> list[list[str]]:

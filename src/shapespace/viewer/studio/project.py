@@ -9,29 +9,49 @@ import json
 import re
 import threading
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import count
+from math import isfinite
+from operator import mul
 from pathlib import Path
-from typing import Any, ClassVar, Literal, cast
+from typing import Any, ClassVar, Literal, TypeAlias, cast
 
 from msgspec import Struct
 from msgspec.structs import replace
 
 from shapespace.batch.result_folder import names_for
-from shapespace.cohort.table import fold_name, is_number, match_rows, names_of_file, notes_on_classes, read_table
+from shapespace.cohort.table import (
+    fold_name,
+    is_number,
+    match_rows,
+    name_key,
+    names_of_file,
+    notes_on_classes,
+    read_table,
+)
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.containers.json_files import read_json
 from shapespace.io.files import atomic_path, make_folder, write_error, write_text
+from shapespace.io.landmarks.landmark_io import read_surface_landmarks, surface_landmarks_text
 from shapespace.io.meshes.mesh_io import MESH_FILE_ENDINGS, mesh_files, stem_of
 from shapespace.io.tables.table_io import DECIMAL_COMMA, KEYS, key_column, table_text
 from shapespace.schemas import json_text, read
-from shapespace.types import MM_PER_UNIT
+from shapespace.store.corresponding import LANDMARKS
+from shapespace.types import MM_PER_UNIT, SurfaceLandmarks
 
 Role = Literal["training", "new"]
+Point: TypeAlias = tuple[float, float, float]
 
 _AGAIN = "restore it from a copy, or start a new project"
 _MOST_CLASSES = 12  # classes of a column that the page counts
+LANDMARK_COLUMN = "landmarks"
+"""Column of a list of scans that names their files of landmarks."""
+LEAST_LANDMARKS = 3
+"""Landmarks that determine a pose."""
+MOST_POINTS = 500
+"""Largest number of names of landmarks, which the page lists for each scan."""
+_LONGEST_NAME = 60  # characters of the name of a landmark
 _MOST_UNDONE = 100  # edits that can be undone
 _LONGEST_ID, _LONGEST_CELL = 100, 1000  # characters
 _NO_FILE_NAME = re.compile(r'[/\\:*?"<>|\x00-\x1f]')
@@ -49,6 +69,7 @@ class Specimen(Struct, frozen=True, kw_only=True):
         unit: unit of the scan, a name of `MM_PER_UNIT`; empty if commands read the scan as it is.
         mirrored: whether its mirror image is used.
         cells: column -> cell of the specimen.
+        points: name -> landmark on the scan, in the frame and unit of its file.
     """
 
     id: str
@@ -58,6 +79,7 @@ class Specimen(Struct, frozen=True, kw_only=True):
     unit: str = ""
     mirrored: bool = False
     cells: dict[str, str] = {}
+    points: dict[str, Point] = {}
 
 
 class State(Struct, frozen=True, kw_only=True):
@@ -67,6 +89,7 @@ class State(Struct, frozen=True, kw_only=True):
         name: name of the project.
         columns: columns of the table, except the id.
         specimens: specimens in the order in which they were added.
+        point_names: names of the landmarks on scans, in their order in files.
         landmarks: name -> vertex of the surfaces in correspondence.
         landmarks_on: folder of these surfaces in the project.
     """
@@ -78,8 +101,14 @@ class State(Struct, frozen=True, kw_only=True):
     name: str
     columns: tuple[str, ...] = ()
     specimens: tuple[Specimen, ...] = ()
+    point_names: tuple[str, ...] = ()
     landmarks: dict[str, int] = {}
     landmarks_on: str = ""
+
+    @property
+    def names(self) -> list[tuple[str, ...]]:
+        """The names by which a table can refer to each specimen: its id, and names of its file."""
+        return [(specimen.id, *names_of_file(Path(specimen.file).name)) for specimen in self.specimens]
 
     def chosen(self, role: Role) -> tuple[Specimen, ...]:
         """Return the included specimens of a role."""
@@ -330,15 +359,22 @@ class Project:
 
     # Files that commands read
 
-    def scan_list(self, path: Path, specimens: Sequence[Specimen]) -> tuple[str, tuple[tuple[str, ...], ...]]:
-        """Return a list of scans with their ids and cells, as `correspond` and `fit` read it, and the commands that
-        write scans in mm and their mirror images, whose output the list names.
+    def scan_list(
+        self, path: Path, specimens: Sequence[Specimen], names: Collection[str] | None = None
+    ) -> tuple[dict[str, str], tuple[tuple[str, ...], ...]]:
+        """Return the list of scans with their ids and cells, as `correspond` and `fit` read it, with the files of their
+        landmarks, and the commands that write scans in mm and their mirror images, whose output the list names.
 
         Args:
             path: path of the list, in a folder of the project.
             specimens: specimens of the list.
+            names: names of the landmarks that the command knows; scans with fewer than three of these landmarks, which
+                determine no pose, are listed without landmarks. None for all landmarks.
         """
         columns, commands = self.state.columns, list[tuple[str, ...]]()
+        columns = tuple(column for column in columns if column.lower() != LANDMARK_COLUMN)  # it would name files
+        marks = self._landmark_texts(specimens, names)
+        marks_folder = f"{path.stem}-landmarks"
         files = {specimen.id: _relative(self.path(specimen), path.parent) for specimen in specimens}
         for unit, mirrored in sorted({(specimen.unit, specimen.mirrored) for specimen in specimens} - {("", False)}):
             group = [specimen for specimen in specimens if (specimen.unit, specimen.mirrored) == (unit, mirrored)]
@@ -351,10 +387,14 @@ class Project:
             options = [*([f"--unit={unit}"] if unit else []), *(["--mirror"] if mirrored else [])]
             commands.append(("check", *scans, "-o", f"{path.parent.name}/{folder}", *options, "--quiet"))
         rows = [
-            (specimen.id, files[specimen.id], *(specimen.cells.get(column, "") for column in columns))
+            (specimen.id, files[specimen.id], *(specimen.cells.get(column, "") for column in columns),
+             *([f"{marks_folder}/{specimen.id}.csv" if specimen.id in marks else ""] if marks else []))
             for specimen in specimens
-        ]
-        return table_text(("id", "file", *columns), rows), tuple(commands)
+        ]  # fmt: skip
+        header = ("id", "file", *columns, *([LANDMARK_COLUMN] if marks else []))
+        texts = {f"{path.parent.name}/{path.name}": table_text(header, rows)}
+        texts |= {f"{path.parent.name}/{marks_folder}/{name}.csv": text for name, text in marks.items()}
+        return texts, tuple(commands)
 
     def table(self, specimens: Iterable[Specimen]) -> str:
         """Return the table of specimens, as `compare` reads it."""
@@ -362,9 +402,42 @@ class Project:
         rows = [(specimen.id, *(specimen.cells.get(column, "") for column in columns)) for specimen in specimens]
         return table_text(("specimen", *columns), rows)
 
-    def landmark_table(self) -> str:
-        """Return the landmarks as a table of name and vertex."""
-        return table_text(("name", "vertex"), list(self.state.landmarks.items()))
+    def landmark_table(self, surfaces: str) -> str:
+        """Return the landmarks of the surfaces in a folder as a table: those that the user placed on them, and those
+        that come from the landmarks of the scans.
+        """
+        path, placed = self.folder / surfaces / LANDMARKS, SurfaceLandmarks.of(self.state.landmarks)
+        of_scans = read_surface_landmarks(path) if path.is_file() else SurfaceLandmarks()
+        others = of_scans.select([name for name in of_scans.names if name not in placed])
+        return surface_landmarks_text(others.joined(placed))
+
+    def point_table(self, specimens: Iterable[Specimen]) -> str:
+        """Return the landmarks on scans, in the frames and units of their files, as a table with a row for each one, as
+        `landmarks convert` reads it; specimens are sorted by name.
+        """
+        rows = [
+            (specimen.id, name, *specimen.points.get(name, ("NA",) * 3))
+            for specimen in sorted(specimens, key=lambda specimen: name_key(specimen.id))
+            for name in self.state.point_names
+        ]
+        return table_text(("specimen", "landmark", *"xyz"), rows)
+
+    def _landmark_texts(self, specimens: Iterable[Specimen], names: Collection[str] | None) -> dict[str, str]:
+        """Return id -> table of the landmarks of each specimen that has some, as they are on the scan that commands
+        read: in mm if it has a unit, and reflected if it is mirrored. See `scan_list` for `names`.
+        """
+        texts: dict[str, str] = {}
+        for specimen in specimens:
+            mm = MM_PER_UNIT[specimen.unit] if specimen.unit else 1.0
+            factors = (-mm if specimen.mirrored else mm, mm, mm)
+            rows = [
+                (name, *map(mul, factors, specimen.points[name]))
+                for name in self.state.point_names
+                if name in specimen.points and (names is None or name in names)
+            ]
+            if len(rows) >= (1 if names is None else LEAST_LANDMARKS):
+                texts[specimen.id] = table_text(("name", *"xyz"), rows)
+        return texts
 
 
 class MatchedBlock(Struct, frozen=True, kw_only=True):
@@ -417,11 +490,7 @@ class PastedBlock(Struct, frozen=True, kw_only=True):
         has_heading = key_column(rows[0]) is not None
         if width == 1 and not self.column:
             raise InputError("The pasted block has one column; paste it into the column that it belongs to.")
-        known = {
-            fold_name(name)
-            for specimen in state.specimens
-            for name in (specimen.id, *names_of_file(Path(specimen.file).name))
-        }
+        known = {fold_name(name) for own in state.names for name in own}
         named = [fold_name(row[0].replace("\\", "/").rpartition("/")[2]) in known for row in rows]
         has_names = any(name and not is_number(row[0]) for name, row in zip(named, rows, strict=True))
         if not has_heading and self.column and not (has_names and width > 1):
@@ -492,7 +561,8 @@ def change_of(request: Mapping[str, Any]) -> Callable[[State], tuple[str, State]
     edits = {
         "cells": _edit_cells, "block": _edit_block, "include": _include, "set": _set_role, "remove": _remove,
         "rename": _rename, "unit": _set_unit, "mirror": _mirror, "add-column": _add_column,
-        "remove-column": _remove_column, "landmarks": _set_landmarks,
+        "remove-column": _remove_column, "landmarks": _set_landmarks, "points": _edit_points,
+        "point-names": _set_point_names,
     }  # fmt: skip
 
     def change(state: State) -> tuple[str, State]:
@@ -594,7 +664,8 @@ def _add_column(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
 
 def _can_be_column(name: str) -> bool:
     """Return whether a column can have a name: it names no specimens, is no term of formulas, and can be quoted."""
-    return key_column([name]) is None and name != "log_size" and "`" not in name
+    is_key = key_column([name], (*KEYS, LANDMARK_COLUMN)) is not None
+    return not is_key and name != "log_size" and "`" not in name
 
 
 def _with_point(value: str, others: Iterable[str]) -> str:
@@ -621,6 +692,75 @@ def _set_landmarks(state: State, request: Mapping[str, Any]) -> tuple[str, State
     return "change the landmarks", replace(state, landmarks=landmarks, landmarks_on=str(request.get("on", "")))
 
 
+def _edit_points(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
+    """Place the landmarks of a specimen, or remove those without coordinates."""
+    name, wanted = str(request["id"]), dict(request["points"])
+    now = next((specimen.points for specimen in state.specimens if specimen.id == name), dict[str, Point]())
+    for mark, before in request.get("before", {}).items():
+        if now.get(mark) != (None if before is None else point_of(before)):
+            raise StaleError(
+                f"Another tab changed the landmark {mark[:_LONGEST_NAME]} of {name} in the meantime; look at it, and "
+                "place it again if it is wrong."
+            )
+    placed = {mark: point_of(point) for mark, point in wanted.items() if point is not None}
+    others = {mark: point for mark, point in now.items() if mark not in wanted}
+    _, edited = with_points(tuple(placed), {name: placed})(
+        _edit_specimens(state, [name], lambda specimen: replace(specimen, points=others))
+    )
+    marks = next(iter(wanted)) if len(wanted) == 1 else f"{len(wanted)} landmarks"
+    return f"{'place' if placed else 'remove'} {marks} {'on' if placed else 'from'} {name}", edited
+
+
+def point_of(values: Iterable[Any]) -> Point:
+    """Return the coordinates of a landmark.
+
+    Raises:
+        InputError: a coordinate is not finite.
+        TypeError, ValueError: they are not three numbers.
+    """
+    x, y, z = map(float, values)
+    if not all(map(isfinite, (x, y, z))):
+        raise InputError("A landmark needs three finite coordinates; give a number for each.")
+    return x, y, z
+
+
+def _set_point_names(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
+    """Set the names of the landmarks; the points of those that are removed are removed from all scans."""
+    names = tuple(str(name).strip() for name in request["names"])
+    specimens = tuple(
+        replace(specimen, points={name: point for name, point in specimen.points.items() if name in names})
+        for specimen in state.specimens
+    )
+    _, edited = with_points(names, {})(replace(state, point_names=(), specimens=specimens))
+    return "change the names of landmarks", edited
+
+
+def with_points(
+    names: Sequence[str], points: Mapping[str, Mapping[str, Point]]
+) -> Callable[[State], tuple[str, State]]:
+    """Return the edit that adds landmarks, with their points by specimen, to those that the project has.
+
+    Raises:
+        InputError: by the edit, if a name cannot be in a table of landmarks, or there are too many names.
+    """
+
+    def change(state: State) -> tuple[str, State]:
+        together = tuple(dict.fromkeys((*state.point_names, *names)))
+        for name in names:
+            is_comment = name.startswith("#")  # in tables
+            if is_comment or name != name.strip() or not 0 < len(name) <= _LONGEST_NAME or not name.isprintable():
+                shown, most = name[:_LONGEST_NAME], f"{_LONGEST_NAME} characters"
+                raise InputError(f"A landmark cannot be called {shown!r}; give it a name of at most {most} without #.")
+        if len(together) > MOST_POINTS:
+            raise InputError(f"There would be {len(together)} names of landmarks, and the studio takes {MOST_POINTS}.")
+        edited = _edit_specimens(
+            state, points, lambda specimen: replace(specimen, points={**specimen.points, **points[specimen.id]})
+        )
+        return f"take landmarks of {_count_text(points)}", replace(edited, point_names=together)
+
+    return change
+
+
 def cells_of_table(
     content: bytes, state: State, name: str = "The table"
 ) -> tuple[list[str], dict[str, dict[str, str]], list[str]]:
@@ -635,8 +775,7 @@ def cells_of_table(
     """
     table = read_table(Path(name), content)
     reserved = [head for head in table.columns if not _can_be_column(head)]
-    named = [(specimen.id, *names_of_file(Path(specimen.file).name)) for specimen in state.specimens]
-    matched, notes = match_rows(table, named, "the project", "name the specimens alike")
+    matched, notes = match_rows(table, state.names, "the project", "name the specimens alike")
     cells = {
         state.specimens[k].id: {
             head: column[row][:_LONGEST_CELL] for head, column in table.columns.items() if head not in reserved
