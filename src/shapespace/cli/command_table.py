@@ -624,8 +624,8 @@ COMMANDS: tuple[CommandSpec, ...] = (
         ),
         (
             "The page is that of the studio, without edits; nothing is written. A project can be shown while the "
-            "studio has it open. The address that is printed contains a token, without which nothing is answered. Ctrl-C ends "
-            "the viewer. Needs the extra view.",
+            "studio has it open. The address that is printed contains a token, without which nothing is answered. "
+            "Ctrl-C ends the viewer. Needs the extra view.",
         ),
         defaults=_FOR_FORMS,
         json=False,
