@@ -16,7 +16,7 @@
   // What a report has beside its data and its words: it is read from a file, and must not act in the page.
   const NOT_SHOWN = "script:not([type='application/octet-stream']), style, link, meta, base, iframe, frame, object, embed, form";
 
-  /** The navigation and the sections of a report; of an answer first what turns, as its sentences are above it already. */
+  /** The navigation and the sections of a report; of an answer first maps and charts that turn, as its sentences are above it already. */
   function contentOf(page, isAnswer) {
     const shown = document.createElement("div");
     const list = page.querySelector("nav ul"), main = page.getElementById("content");
@@ -24,8 +24,9 @@
     if (isAnswer) {
       shown.className = "answer";
       const sectionOf = (item) => page.getElementById(item.firstElementChild.hash.slice(1)).parentElement;
-      const items = Array.from(list.children), maps = items.filter((item) => sectionOf(item).querySelector(".turning"));
-      for (const item of maps.concat(items.filter((other) => !maps.includes(other)))) {
+      const rank = (item) => (sectionOf(item).querySelector("[data-widget=morph], [data-widget=modes]") ? 0 : sectionOf(item).querySelector(".turning") ? 1 : 2);
+      for (const item of Array.from(list.children).sort((a, b) => rank(a) - rank(b))) {
+        sectionOf(item).classList.toggle("turns", rank(item) < 2);
         list.append(item);
         main.append(sectionOf(item));
       }

@@ -19,8 +19,7 @@
   const Answer = ({ job }) => html`
     <div class="answer" data-testid="answer">
       ${job.sentences.length > 0 && html`<h3>${Q.findings}</h3><ul data-testid="sentences">${job.sentences.map((sentence) => html`<li>${sentence}</li>`)}</ul>`}
-      ${job.methods && html`<details data-testid="methods"><summary>${Q.paper}</summary><p>${job.methods}</p><${CopyButton} text=${job.methods} label=${Q.copyPaper} testid="copy-methods" /></details>`}
-      <div class="row"><${Button} edits small testid="figures" onclick=${() => Studio.runFigures(job)}>${Q.figures}<//></div>
+      <div class="row"><${Button} edits small testid="figures" onclick=${() => Studio.runFigures(job)}>${Q.figures}<//>${job.methods && html`<details data-testid="methods"><summary>${Q.paper}</summary><p>${job.methods}</p><${CopyButton} text=${job.methods} label=${Q.copyPaper} testid="copy-methods" /></details>`}</div>
     </div>`;
 
   function Question({ kind, next, onback }) {
