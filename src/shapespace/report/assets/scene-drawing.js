@@ -153,7 +153,9 @@
         const named = marks.length <= 12 || (view._hovered && view._hovered.id === id && view._hovered.vertex === k);
         const [x, y, depth] = view.project(mark.position);
         // What is well behind the middle is on the far side of the surface.
-        if (mark.label && named && depth < 0.02 * Math.hypot(...view._camera.state.extent)) write(mark.label, x + 10, y);
+        if (!mark.label || !named || depth >= 0.02 * Math.hypot(...view._camera.state.extent)) return;
+        const width = context.measureText(mark.label).width / ratio;
+        write(mark.label, x + 10 + width > view._frame.clientWidth ? x - 10 - width : x + 10, y);
       });
     }
     const taken = [], font = context.font;

@@ -83,8 +83,8 @@
 
     // Camera
 
-    /** Go to where all that is visible, or the given ids, fills the picture from the front; margin 1.1 leaves more. */
-    frame(ids, margin = 1) {
+    /** Go to where all that is visible, or the given ids, fills the picture from the front, or `turned` from any side; margin 1.1 leaves more. */
+    frame(ids, margin = 1, turned = false) {
       if (!this.works) return;
       const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
       for (const thing of this._things.values()) {
@@ -100,6 +100,7 @@
       const { state } = this._camera;
       state.target = low.map((value, axis) => (value + high[axis]) / 2);
       state.extent = low.map((value, axis) => Math.max((high[axis] - value) * margin, 1e-3));
+      if (turned) state.extent.fill(Math.max(...state.extent));
       Object.assign(state, { yaw: 0, pitch: 0, roll: 0, zoom: 1 });
       this._camera.home = copyCamera(state);
       this._moved();

@@ -201,7 +201,7 @@
           made.lines("borders", points, BORDER);
           setBorders(points.length / 2);
         }
-        made.frame(["scan"], 1.1);
+        made.frame(["scan"], 1, true);
         made.on("draw", () => drawScale(made, bar.current, specimen.unit || S.scan.units));
         setState("");
       };

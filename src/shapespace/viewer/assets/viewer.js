@@ -5,6 +5,7 @@
   const Viewer = window.ShapespaceViewer;
   const { save, guarded } = Viewer;
   const TABS = ["model", "compare", "fits"];
+  const ROOM = 1.2; // of the mean shape in the picture, as other shapes are larger in some directions
 
   /** Return "2:-1.5,3:0.2" for coefficients z, and the reverse; modes that are 0 are omitted. */
   const textOf = (z) => Array.from(z, (value, k) => [k + 1, Number(value.toFixed(4))]).filter(([, value]) => value).map((pair) => pair.join(":")).join();
@@ -64,7 +65,7 @@
         page.stage.split(false);
         drawn = fitsTab.draw();
       }
-      if (name !== "fits") page.stage.a.frame(["model"]);
+      if (name !== "fits") page.stage.a.frame(["model"], ROOM);
       page.onplace();
       return drawn;
     }
@@ -105,7 +106,7 @@
       compareTab.start();
       startTabs();
       modelTab.draw();
-      page.stage.a.frame(["model"]);
+      page.stage.a.frame(["model"], ROOM);
       $("loading").hidden = true;
       if (!page.stage.a.works) ready();
       await fitsTab.start(wanted.fit);
