@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast
 from shapespace.errors import FitError
 
 if TYPE_CHECKING:
+    from concurrent.futures import ProcessPoolExecutor
     from multiprocessing.connection import Connection
     from multiprocessing.context import ForkServerContext, SpawnContext
 
@@ -86,6 +87,8 @@ WARM_UP = "SHAPESPACE_WARM_UP"
 COPIED = sys.platform == "linux"
 """Whether workers are copies of one server. Apple's BLAS does not support fork, and Windows has no fork."""
 _WARM = "shapespace.batch.warm"  # loads the code of a fit; imports this module
+DRAWING = ("shapespace.report.pages.page", "shapespace.report.figures.fit_figures")
+"""Modules of processes that draw figures of fits."""
 _BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -137,6 +140,29 @@ def preload(modules: Sequence[str], environment: Mapping[str, str] | None = None
                 del os.environ[name]
             else:
                 os.environ[name] = value
+
+
+@contextlib.contextmanager
+def process_pool(*modules: str) -> Generator[ProcessPoolExecutor | None]:
+    """Yield processes, one per core, which import `modules` first and end with this process; None on a single core."""
+    if cores() < 2:
+        yield None
+        return
+    from concurrent.futures import ProcessPoolExecutor
+
+    preload(modules)
+    pool = ProcessPoolExecutor(cores(), context(), initializer=_start_in_pool)
+    try:
+        yield pool
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _start_in_pool() -> None:
+    """Ignore Ctrl-C, and end with the parent process also when it is killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if (parent := multiprocessing.parent_process()) is not None:
+        end_after(parent.join)
 
 
 def wait_until_loaded() -> None:

@@ -6,6 +6,7 @@ import inspect
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from itertools import product
 from math import nan
 from types import MappingProxyType
@@ -50,7 +51,7 @@ from shapespace.report.blocks.wording import (
     words,
 )
 from shapespace.report.inputs.saved_fits import Direction, Folder, Measure, SavedFit, StagedFit, measured_mm
-from shapespace.report.pages.page import Page
+from shapespace.report.pages.page import OrderedPicture, Page
 from shapespace.report.render import thumbnails
 from shapespace.report.render.scene import pack_fit, pack_model, pack_scatter, pack_surfaces
 from shapespace.schemas import Quality, VertexErrors, read
@@ -213,6 +214,7 @@ def fit_in_full(
     """
     if page.left < _DETAIL_BYTES + reserve:
         return [Text("Its pictures would make this file larger than 8 MB, so they are omitted.", "soft")]
+    order_pictures(page, fit, population)
     turning = page.tried(lambda: fit_to_turn(page, fit))
     pictures = fit_pictures(page, fit, population, of_paper=of_paper)
     stages, iterations = ("", "") if fit.regions is None else ("stages, ", "iterations, ")
@@ -273,6 +275,25 @@ def share_within(fit: StagedFit, limit_mm: float) -> str:
     return percent(float((known <= limit_mm).mean())) if len(known) else "none"
 
 
+def order_pictures(page: Page, fit: StagedFit, population: FloatArray | None) -> Mapping[str, OrderedPicture]:
+    """Order all pictures of one fit, as early as possible, and return them by the names of their functions.
+
+    Args:
+        page: page of the pictures.
+        fit: fit with its stages; pictures of the same object are ordered once.
+        population: (N, K) coefficients of other fits in standard deviations, or None.
+    """
+    names = [name for name in _CAPTIONS if fit.regions is not None or name not in _OF_STAGES]
+    options: Mapping[str, Any] = {"coefficients_figure": {"population": population}}
+    return page.once(
+        ("pictures", fit),
+        lambda: {
+            name: page.order(partial(getattr(figures, name), fit, **options.get(name, {})), chart=name in _CHARTS)
+            for name in names
+        },
+    )
+
+
 def fit_pictures(page: Page, fit: StagedFit, population: FloatArray | None, *, of_paper: bool) -> Block:
     """Return all pictures of one fit for `fit_in_full`."""
     stages = {"before": "before", "initial": "after phase 1", "final": "after phase 2", "dense": "dense"}
@@ -296,26 +317,23 @@ def fit_pictures(page: Page, fit: StagedFit, population: FloatArray | None, *, o
         "coefficients_figure": f"Coefficients of {fit.label}: " + ", ".join(f"{value:.1f}" for value in fit.z[:10]),
     }
 
-    def picture(name: str, alt: str) -> Figure:
-        return page.figure(
-            getattr(figures, name)(fit, **({"population": population} if name == "coefficients_figure" else {})),
-            ((_OF_PAPER.get(name, "") if of_paper else "") + _CAPTIONS[name]),
-            alt=alt,
-            chart=name in ("history_figure", "coefficients_figure"),
-        )
+    def picture(name: str, ordered: OrderedPicture) -> Figure:
+        caption = (_OF_PAPER.get(name, "") if of_paper else "") + _CAPTIONS[name]
+        return page.figure(ordered, caption, alt=alts[name], chart=name in _CHARTS)
 
     return in_columns(
         *(
             block
-            for name, alt in alts.items()
-            if fit.regions is not None or name not in _OF_STAGES
-            for block in page.tried(lambda name=name, alt=alt: picture(name, alt))
+            for name, ordered in order_pictures(page, fit, population).items()
+            for block in page.tried(lambda name=name, ordered=ordered: picture(name, ordered))
         )
     )
 
 
 _OF_STAGES = ("stages_figure", "regions_figure", "history_figure")
 """Figures that need the output of --stages."""
+_CHARTS = ("history_figure", "coefficients_figure")
+"""Figures of few colours, which are smaller without loss."""
 _CAPTIONS = {
     "stages_figure": "The scan, and the model at each stage of the fit, in the frame of the final pose.",
     "overlay_figure": "Scan and model over each other, the nearer one shown: where they alternate finely, they "

@@ -5,7 +5,8 @@ from __future__ import annotations
 import base64
 import hashlib
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from concurrent.futures import BrokenExecutor, Executor, Future
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -46,18 +47,50 @@ class Chapter:
     link: str = ""
 
 
+@dataclass(frozen=True, eq=False)
+class OrderedPicture:
+    """A drawing that another process may make while this one continues with the page.
+
+    Args:
+        draw: function that returns the drawing.
+        lossless: whether it is encoded without loss, as charts are.
+        future: the encoded drawing of another process; None if it is made in this process when it is needed.
+    """
+
+    draw: Callable[[], Drawing]
+    lossless: bool
+    future: Future[Still] | None
+
+    def still(self) -> Still:
+        """Return the encoded drawing; it is made here if the other process has ended, as for want of memory.
+
+        Raises:
+            ShapespaceError: raised by `draw`.
+        """
+        if self.future is not None:
+            with suppress(BrokenExecutor):
+                return self.future.result()
+        return _drawn_still(self.draw, lossless=self.lossless)
+
+
+def _drawn_still(draw: Callable[[], Drawing], *, lossless: bool) -> Still:
+    return figures.encode_webp(draw(), lossless=lossless)
+
+
 class Page:
     """Builder of a page: embedded data, the number of bytes so far, and the reasons of sections that failed.
 
     Args:
         on_step: called after each picture.
+        executor: processes that draw ordered pictures; None for this process.
     """
 
     planned: int = 1
     """Expected number of pictures."""
 
-    def __init__(self, on_step: Step | None = None) -> None:
+    def __init__(self, on_step: Step | None = None, executor: Executor | None = None) -> None:
         self._on_step = on_step
+        self._executor = executor
         self._payloads: list[str] = []
         self._anchors: set[str] = set()
         self._loaded: dict[object, Any] = {}
@@ -121,14 +154,29 @@ class Page:
         """Return a context in which surfaces are drawn in the views of an analysis."""
         return figures.oriented(orientation)
 
-    def figure(self, figure: Drawing, caption: str, *, alt: str, chart: bool = False) -> Figure:
+    def order(self, draw: Callable[[], Drawing], *, chart: bool) -> OrderedPicture:
+        """Return a drawing for `figure` that is made in another process, if there is one.
+
+        Args:
+            draw: function that returns the drawing; other processes must be able to load it.
+            chart: as for `figure`.
+        """
+        future = None
+        if self._executor is not None:
+            with suppress(BrokenExecutor, OSError, EOFError):  # no process can start: the page is made without
+                future = self._executor.submit(_drawn_still, draw, lossless=chart)
+        return OrderedPicture(draw, chart, future)
+
+    def figure(self, figure: Drawing | OrderedPicture, caption: str, *, alt: str, chart: bool = False) -> Figure:
         """Return a drawing with its caption; `alt` describes the drawing."""
         still = self.still(figure, alt, lossless=chart)
         self.step(caption)
         return Figure(still, caption, "chart" if chart else "drawing")
 
-    def still(self, figure: Drawing, alt: str, *, lossless: bool = False) -> Image:
+    def still(self, figure: Drawing | OrderedPicture, alt: str, *, lossless: bool = False) -> Image:
         """Return a drawing as an image of this page, such as the still picture of a widget."""
+        if isinstance(figure, OrderedPicture):
+            return self.image(figure.still(), alt)
         return self.image(figures.encode_webp(figure, lossless=lossless), alt)
 
     def image(self, still: Still, alt: str) -> Image:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -26,7 +27,7 @@ from shapespace.report.inputs.saved_fits import Folder, find_fits
 from shapespace.report.pages.correspondence_page import CorrespondencePage
 from shapespace.report.pages.demo_page import DemoPage
 from shapespace.report.pages.folder_page import MOST_ROWS, FolderPage, ManyPage, is_many
-from shapespace.report.pages.page import LARGEST_REPORT_BYTES, Chapter, Make, Page, Step
+from shapespace.report.pages.page import LARGEST_REPORT_BYTES, Chapter, Make, OrderedPicture, Page, Step
 from shapespace.report.pages.study_page import ANALYSIS, standalone_file, study_page
 from shapespace.schemas import Analysis, CorrespondenceRecord, Orientation, Quality
 from shapespace.store.results import Results
@@ -75,6 +76,7 @@ def write_report(
     model: Path | None = None,
     labels: Path | None = None,
     on_step: Step | None = None,
+    executor: Executor | None = None,
 ) -> Path:
     """Write one HTML file on the results saved in `folder`, and return its path.
 
@@ -90,6 +92,7 @@ def write_report(
         model: file of the model of the fits; None for the path in their records. Not for a demo or a study.
         labels: table of labels of the scans; None looks for labels.csv in `folder`, then next to the scans.
         on_step: called after each picture.
+        executor: processes that draw most pictures of fits, such as a `ProcessPoolExecutor`; None for this process.
 
     Raises:
         FileError: the folder, demo.json, `model` or `labels` cannot be read, or the report cannot be written.
@@ -100,7 +103,7 @@ def write_report(
     """
     require_report_extra()
     path = Path(output) if output is not None else Path(folder) / "report.html"
-    write_text(path, _html(Folder(Path(folder)), model, labels, Page(on_step)))
+    write_text(path, _html(Folder(Path(folder)), model, labels, Page(on_step, executor)))
     return path
 
 
@@ -334,15 +337,17 @@ class _FigureFiles(Page):
         self.notes.append(f"The figure {self.headings[-1]!r} could not be drawn: {error}")
         return super().failed(error)
 
-    def still(self, figure: Drawing, alt: str, *, lossless: bool = False) -> Image:
+    def still(self, figure: Drawing | OrderedPicture, alt: str, *, lossless: bool = False) -> Image:
         """Record a drawing."""
+        figure = figure.draw() if isinstance(figure, OrderedPicture) else figure
         self.drawn.append((self.headings[0], self.headings[-1], figure))
         return Image(b"", (1, 1), alt)
 
-    def figure(self, figure: Drawing, caption: str, *, alt: str, chart: bool = False) -> Figure:
+    def figure(self, figure: Drawing | OrderedPicture, caption: str, *, alt: str, chart: bool = False) -> Figure:
         """Record a drawing with its caption."""
-        self.captions[figure] = caption
-        return super().figure(figure, caption, alt=alt, chart=chart)
+        drawing = figure.draw() if isinstance(figure, OrderedPicture) else figure
+        self.captions[drawing] = caption
+        return super().figure(drawing, caption, alt=alt, chart=chart)
 
     def turning(
         self, widget: Any, payload: bytes, poster: Image, caption: str, *, label: str, still: str
