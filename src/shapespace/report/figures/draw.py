@@ -461,7 +461,7 @@ def encode_webp(figure: Figure, *, lossless: bool = False) -> Still:
         np.asarray(canvas.buffer_rgba())[:, :, :3],
         lossless=lossless,
         quality=20 if lossless else 78,
-        effort=1 if lossless else 3,
+        effort=1 if lossless else 2,
     )
 
 

@@ -12,7 +12,6 @@ from typing import Any, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
 from shapespace.compiled import compiled
@@ -306,6 +305,10 @@ def _rasterise(
     return triangle, nearest
 
 
+_vertex_normals = cached_with_owner()(vertex_normals)
+"""Vertex normals, computed once for all views of a mesh."""
+
+
 def _surfels(layer: Layer, camera: Camera, size: tuple[int, int], supersample: int) -> _Surfels:
     if layer.mesh.faces is None:
         return _balls(layer, camera, size, supersample)
@@ -318,7 +321,7 @@ def _surfels(layer: Layer, camera: Camera, size: tuple[int, int], supersample: i
     scalars = read_only(np.zeros(0)) if layer.scalars is None else layer.scalars
     scalar = np.empty(len(pixel) if len(scalars) else 0, dtype=np.float32)
     nearness = np.ones(len(vertices)) if camera.distance_mm is None else -depth
-    normals = vertex_normals(layer.mesh) @ _view_axes(camera.yaw_deg, camera.pitch_deg).T
+    normals = _vertex_normals(layer.mesh) @ _view_axes(camera.yaw_deg, camera.pitch_deg).T
     interpolate(
         pixel, triangle[pixel], screen, nearness, faces, normals, scalars, layer.categories, size[0],
         normal, scalar, is_back,
@@ -456,21 +459,67 @@ def _occlusion(
 ) -> _Single:
     """Return (n,) in (0, 1]: darker where a point lies behind its neighbours' mean depth (Luft et al. 2006)."""
     width, height = size
-    is_surface = np.zeros((height, width), dtype=np.float32)
-    is_surface.ravel()[pixel] = 1
-    depth = np.zeros((height, width), dtype=np.float32)
+    depth = np.full((height, width), np.nan, dtype=np.float32)
     depth.ravel()[pixel] = depth_mm
-    coarse = (slice(None, None, supersample), slice(None, None, supersample))
+    depth = depth[::supersample, ::supersample]
+    is_surface = np.isfinite(depth)
+    both = (is_surface.astype(np.float32), np.where(is_surface, depth, np.float32(0)))
     out = np.ones(len(pixel), dtype=np.float32)
-    row, column = pixel // width // supersample, pixel % width // supersample
     # The wide one shades the eye sockets and below the chin, the narrow one draws lips, lids and folds.
     for radius_share, max_depth, strength in ((0.026, 0.035, 26.0), (0.007, 0.010, 42.0)):
         sigma = radius_share * height / supersample
-        total = gaussian_filter(is_surface[coarse], sigma, truncate=2.5)
-        mean = gaussian_filter(depth[coarse], sigma, truncate=2.5) / np.maximum(total, 1e-6)
-        depth_behind = np.clip(depth_mm - mean[row, column], 0, max_depth * camera.height_mm)
+        weights = np.exp(-0.5 / sigma**2 * np.arange(int(2.5 * sigma + 0.5) + 1) ** 2)
+        weights /= weights[0] + 2 * weights[1:].sum()
+        total, mean = (np.empty_like(depth) for _ in both)
+        for values, blurred in zip(both, (total, mean), strict=True):
+            blur(values, weights, blurred)
+        mean /= np.maximum(total, np.float32(1e-6))
+        around = mean.repeat(supersample, axis=0).repeat(supersample, axis=1).ravel()[pixel]
+        depth_behind = np.clip(depth_mm - around, 0, max_depth * camera.height_mm)
         out *= np.exp(np.float32(-strength / camera.height_mm) * depth_behind)
     return out
+
+
+@compiled
+def blur(image: npt.NDArray[np.float32], weights: FloatArray, out: npt.NDArray[np.float32]) -> None:
+    """Blur an image by a symmetric separable filter; beyond its edges it is mirrored.
+
+    The inner loops run along rows, so that they are vectorised, unlike those of `scipy.ndimage`; results are equal.
+
+    Args:
+        image: (height, width).
+        weights: (n,) weights at 0, 1, ... n - 1 pixels.
+        out: (height, width), written.
+    """
+    height, width = image.shape
+    reach = len(weights) - 1
+    total, line = np.empty(width), np.empty(width + 2 * reach)
+    for row in range(height):
+        total[:] = weights[0] * image[row]
+        for k in range(reach, 0, -1):
+            above, below = image[mirrored(row - k, height)], image[mirrored(row + k, height)]
+            weight = weights[k]
+            for column in range(width):
+                total[column] += (np.float64(above[column]) + np.float64(below[column])) * weight
+        out[row] = total
+    for row in range(height):
+        for column in range(-reach, width + reach):
+            line[column + reach] = out[row, mirrored(column, width)]
+        for column in range(width):
+            total[column] = weights[0] * line[column + reach]
+        for k in range(reach, 0, -1):
+            left, right = line[reach - k : reach - k + width], line[reach + k : reach + k + width]
+            weight = weights[k]
+            for column in range(width):
+                total[column] += (left[column] + right[column]) * weight
+        out[row] = total
+
+
+@compiled
+def mirrored(index: int, count: int) -> int:
+    """Return the index in 0 ... `count` - 1 of a sequence that is mirrored at its ends again and again."""
+    index %= 2 * count
+    return index if index < count else 2 * count - 1 - index
 
 
 _TINY = 1e-9  # pixels; keeps triangles that share an edge without gaps
