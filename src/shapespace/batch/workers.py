@@ -23,15 +23,17 @@ from dataclasses import dataclass
 from importlib import import_module
 from multiprocessing.connection import wait
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ParamSpec, Protocol, TypeVar, cast
 
 from shapespace.errors import FitError
+from shapespace.lazy import Defer, call_later
 
 if TYPE_CHECKING:
-    from concurrent.futures import ProcessPoolExecutor
     from multiprocessing.connection import Connection
     from multiprocessing.context import ForkServerContext, SpawnContext
 
+P = ParamSpec("P")
+T = TypeVar("T")
 TaskT = TypeVar("TaskT", contravariant=True)
 AnswerT = TypeVar("AnswerT", covariant=True)
 
@@ -102,17 +104,18 @@ def context() -> ForkServerContext | SpawnContext:
     return multiprocessing.get_context("forkserver") if COPIED else multiprocessing.get_context("spawn")
 
 
-def start_loading(*, notify: bool) -> None:
+def start_loading(*modules: str, notify: bool) -> None:
     """Load the code of the workers in the background; for workers that are new processes, compile it if needed.
 
     Args:
+        modules: names of further modules of the workers.
         notify: whether a line on standard error may state that the code is being compiled.
     """
     mark = share_mark() if notify else remove_mark()
     if not COPIED:
         import_module(_WARM).warm_up(notify=notify)
         return
-    preload((_WARM,), {WARM_UP: "notify" if notify else "quiet", MARK: mark})
+    preload((_WARM, *modules), {WARM_UP: "notify" if notify else "quiet", MARK: mark})
 
 
 def preload(modules: Sequence[str], environment: Mapping[str, str] | None = None) -> None:
@@ -143,26 +146,45 @@ def preload(modules: Sequence[str], environment: Mapping[str, str] | None = None
 
 
 @contextlib.contextmanager
-def process_pool(*modules: str) -> Generator[ProcessPoolExecutor | None]:
-    """Yield processes, one per core, which import `modules` first and end with this process; None on a single core."""
+def deferred_calls() -> Generator[Defer]:
+    """Yield a function that starts calls in other processes, one per core, which end at the end of the block.
+
+    A process that ends early, as for want of memory, leaves its calls to this process, as does a single core.
+    """
     if cores() < 2:
-        yield None
+        yield call_later
         return
-    from concurrent.futures import ProcessPoolExecutor
+    from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 
-    preload(modules)
-    pool = ProcessPoolExecutor(cores(), context(), initializer=_start_in_pool)
-    try:
-        yield pool
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
+    def defer(function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Callable[[], T]:
+        try:
+            future = pool.submit(function, *args, **kwargs)
+        except (BrokenExecutor, EOFError, OSError):
+            return call_later(function, *args, **kwargs)
+
+        def wait_for_result() -> T:
+            try:
+                return future.result()
+            except BrokenExecutor:
+                return function(*args, **kwargs)
+
+        return wait_for_result
+
+    with life_line() as life:
+        pool = ProcessPoolExecutor(cores(), context(), initializer=_start_in_pool, initargs=(life,))
+        try:
+            yield defer
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _start_in_pool() -> None:
-    """Ignore Ctrl-C, and end with the parent process also when it is killed."""
+def _start_in_pool(life: Connection) -> None:
+    """Ignore Ctrl-C, end with the life line, and use one core."""
+    from threadpoolctl import threadpool_limits
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if (parent := multiprocessing.parent_process()) is not None:
-        end_after(parent.join)
+    end_after(lambda: life.poll(None))
+    threadpool_limits(1)
 
 
 def wait_until_loaded() -> None:

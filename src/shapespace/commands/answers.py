@@ -7,9 +7,10 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from shapespace.batch.progress import progress, waiting
-from shapespace.batch.workers import DRAWING, process_pool
+from shapespace.batch.workers import DRAWING, deferred_calls, preload
 from shapespace.commands.outcome import Outcome
 from shapespace.errors import InputError, ShapespaceError
+from shapespace.lazy import call_later
 from shapespace.report.analyses.analysis_report import AnalysisReport
 from shapespace.schemas import to_json
 from shapespace.store.results import ENDING
@@ -83,12 +84,14 @@ def write_report(folder: Path, output: Path | None, *, model: Path | None, label
     """
     with ExitStack() as stack:
         # Before the imports of this process, which take as long as those of the others.
-        fits = any(folder.glob(f"*{ENDING}")) or (folder / "demo.json").is_file()
-        pool = stack.enter_context(process_pool(*DRAWING)) if fits else None
+        defer = call_later
+        if any(folder.glob(f"*{ENDING}")) or (folder / "demo.json").is_file():
+            preload(DRAWING)
+            defer = stack.enter_context(deferred_calls())
         step = stack.enter_context(drawing(quiet=quiet))
         from shapespace.report.pages import write_html as html
 
-        return html.write_report(folder, output, model=model, labels=labels, on_step=step, executor=pool)
+        return html.write_report(folder, output, model=model, labels=labels, on_step=step, defer=defer)
 
 
 @contextmanager

@@ -5,14 +5,14 @@ from __future__ import annotations
 import base64
 import hashlib
 from collections.abc import Callable, Sequence
-from concurrent.futures import BrokenExecutor, Executor, Future
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar
 
 from shapespace.errors import ShapespaceError
+from shapespace.lazy import Defer, call_later
 from shapespace.report import figures
 from shapespace.report.blocks.blocks import Block, Cell, Figure, Image, Section, Text, Turning
 from shapespace.report.blocks.wording import anchor
@@ -53,24 +53,11 @@ class OrderedPicture:
 
     Args:
         draw: function that returns the drawing.
-        lossless: whether it is encoded without loss, as charts are.
-        future: the encoded drawing of another process; None if it is made in this process when it is needed.
+        still: function that waits for the encoded drawing, and raises the errors of `draw`.
     """
 
     draw: Callable[[], Drawing]
-    lossless: bool
-    future: Future[Still] | None
-
-    def still(self) -> Still:
-        """Return the encoded drawing; it is made here if the other process has ended, as for want of memory.
-
-        Raises:
-            ShapespaceError: raised by `draw`.
-        """
-        if self.future is not None:
-            with suppress(BrokenExecutor):
-                return self.future.result()
-        return _drawn_still(self.draw, lossless=self.lossless)
+    still: Callable[[], Still]
 
 
 def _drawn_still(draw: Callable[[], Drawing], *, lossless: bool) -> Still:
@@ -82,15 +69,15 @@ class Page:
 
     Args:
         on_step: called after each picture.
-        executor: processes that draw ordered pictures; None for this process.
+        defer: function that starts the drawing of ordered pictures.
     """
 
     planned: int = 1
     """Expected number of pictures."""
 
-    def __init__(self, on_step: Step | None = None, executor: Executor | None = None) -> None:
+    def __init__(self, on_step: Step | None = None, defer: Defer = call_later) -> None:
         self._on_step = on_step
-        self._executor = executor
+        self._defer = defer
         self._payloads: list[str] = []
         self._anchors: set[str] = set()
         self._loaded: dict[object, Any] = {}
@@ -161,11 +148,7 @@ class Page:
             draw: function that returns the drawing; other processes must be able to load it.
             chart: as for `figure`.
         """
-        future = None
-        if self._executor is not None:
-            with suppress(BrokenExecutor, OSError, EOFError):  # no process can start: the page is made without
-                future = self._executor.submit(_drawn_still, draw, lossless=chart)
-        return OrderedPicture(draw, chart, future)
+        return OrderedPicture(draw, self._defer(_drawn_still, draw, lossless=chart))
 
     def figure(self, figure: Drawing | OrderedPicture, caption: str, *, alt: str, chart: bool = False) -> Figure:
         """Return a drawing with its caption; `alt` describes the drawing."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -18,6 +17,7 @@ from shapespace.cohort.orientation import find_orientation
 from shapespace.cohort.table import Table, read_table
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.io.files import make_folder, write_text
+from shapespace.lazy import Defer, call_later
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report import figures
 from shapespace.report.blocks import sections
@@ -76,7 +76,7 @@ def write_report(
     model: Path | None = None,
     labels: Path | None = None,
     on_step: Step | None = None,
-    executor: Executor | None = None,
+    defer: Defer = call_later,
 ) -> Path:
     """Write one HTML file on the results saved in `folder`, and return its path.
 
@@ -92,7 +92,8 @@ def write_report(
         model: file of the model of the fits; None for the path in their records. Not for a demo or a study.
         labels: table of labels of the scans; None looks for labels.csv in `folder`, then next to the scans.
         on_step: called after each picture.
-        executor: processes that draw most pictures of fits, such as a `ProcessPoolExecutor`; None for this process.
+        defer: function that starts the drawing of pictures of fits, perhaps in other processes, and returns a function
+            that waits for the result; default: they are drawn in this process when they are needed.
 
     Raises:
         FileError: the folder, demo.json, `model` or `labels` cannot be read, or the report cannot be written.
@@ -103,7 +104,7 @@ def write_report(
     """
     require_report_extra()
     path = Path(output) if output is not None else Path(folder) / "report.html"
-    write_text(path, _html(Folder(Path(folder)), model, labels, Page(on_step, executor)))
+    write_text(path, _html(Folder(Path(folder)), model, labels, Page(on_step, defer)))
     return path
 
 
