@@ -146,10 +146,13 @@ def preload(modules: Sequence[str], environment: Mapping[str, str] | None = None
 
 
 @contextlib.contextmanager
-def deferred_calls() -> Generator[Defer]:
+def deferred_calls(*modules: str) -> Generator[Defer]:
     """Yield a function that starts calls in other processes, one per core, which end at the end of the block.
 
     A process that ends early, as for want of memory, leaves its calls to this process, as does a single core.
+
+    Args:
+        modules: names of modules of the calls, which are imported in the background.
     """
     if cores() < 2:
         yield call_later
@@ -170,6 +173,7 @@ def deferred_calls() -> Generator[Defer]:
 
         return wait_for_result
 
+    preload(modules)
     with life_line() as life:
         pool = ProcessPoolExecutor(cores(), context(), initializer=_start_in_pool, initargs=(life,))
         try:

@@ -7,7 +7,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from shapespace.batch.progress import progress, waiting
-from shapespace.batch.workers import DRAWING, deferred_calls, preload
+from shapespace.batch.workers import DRAWING, deferred_calls
 from shapespace.commands.outcome import Outcome
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.lazy import call_later
@@ -86,8 +86,7 @@ def write_report(folder: Path, output: Path | None, *, model: Path | None, label
         # Before the imports of this process, which take as long as those of the others.
         defer = call_later
         if any(folder.glob(f"*{ENDING}")) or (folder / "demo.json").is_file():
-            preload(DRAWING)
-            defer = stack.enter_context(deferred_calls())
+            defer = stack.enter_context(deferred_calls(*DRAWING))
         step = stack.enter_context(drawing(quiet=quiet))
         from shapespace.report.pages import write_html as html
 

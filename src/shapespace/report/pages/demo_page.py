@@ -242,11 +242,7 @@ class DemoPage:
             "Mean and first modes": lambda: self.modes(experiment, "Paper, figures 2 and 3. "),
             "The test faces": lambda: self.test_faces(tests),
             "From far away, step by step": lambda: (
-                [
-                    block
-                    for fit, label, population_z in farthest
-                    for block in self.one_fit(fit, label, population_z)
-                ]
+                [block for fit, label, population_z in farthest for block in self.one_fit(fit, label, population_z)]
                 or [_NOTHING]
             ),
             "Test faces, fitted": lambda: self.all_fitted(tests),

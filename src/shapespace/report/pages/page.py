@@ -146,7 +146,7 @@ class Page:
 
         Args:
             draw: function that returns the drawing; other processes must be able to load it.
-            chart: as for `figure`.
+            chart: whether it is a chart, which is encoded without loss.
         """
         return OrderedPicture(draw, self._defer(_drawn_still, draw, lossless=chart))
 
