@@ -6,6 +6,7 @@ import inspect
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import product
 from math import nan
@@ -66,6 +67,7 @@ SCAN_TRIANGLES = 8_000
 
 _From = TypeVar("_From")
 _To = TypeVar("_To")
+_MODES_DRAWN = 5  # rows of the picture of the modes
 _CAPTION_HEIGHT = 0.14
 """Height of the caption of a figure, as a share of the figure's width."""
 _DETAIL_BYTES = 1_300_000  # bytes of the page that all pictures of one fit take
@@ -122,7 +124,7 @@ def model_part(page: Page, model: ShapeModel, *, figure_of: str = "", to_move: i
         ("Provenance", model.provenance),
         ("Licence", model.licence or "not stated"),
     ]
-    n_shown = min(5, model.n_modes)
+    n_shown = min(_MODES_DRAWN, model.n_modes)
     return [
         modes_to_move(page, model, to_move),
         Facts(rows, "The shape model"),
@@ -131,7 +133,7 @@ def model_part(page: Page, model: ShapeModel, *, figure_of: str = "", to_move: i
             [
                 in_columns(
                     page.figure(
-                        figures.modes_figure(model, modes=n_shown),
+                        order_modes(page, model),
                         f"{figure_of}Each row: the mean with one mode at −3, 0 and +3 standard deviations, and how far "
                         "each point moves at 3. One scale for all rows.",
                         alt=f"Mean shape and the first {counted(n_shown, 'mode')} at minus and plus three standard "
@@ -153,6 +155,16 @@ def model_part(page: Page, model: ShapeModel, *, figure_of: str = "", to_move: i
             ],
         ),
     ]
+
+
+def order_modes(page: Page, model: ShapeModel) -> OrderedPicture:
+    """Order the picture of the first modes of a model once, as early as possible."""
+
+    def order() -> OrderedPicture:
+        drawn = replace(model, training=None)  # which may be large, and is not drawn
+        return page.order(partial(figures.modes_figure, drawn, modes=min(_MODES_DRAWN, model.n_modes)), chart=False)
+
+    return page.once(("modes", model), order)
 
 
 def quality_part(page: Page, folder: Folder) -> Figure:

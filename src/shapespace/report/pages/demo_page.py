@@ -63,6 +63,8 @@ class DemoPage:
         for fit, label, population_z in self.in_full():
             with suppress(ShapespaceError):  # the section of the fit states the reason
                 sections.order_pictures(self.page, self.staged(fit, label), _coefficients(population_z))
+        with suppress(ShapespaceError):
+            sections.order_modes(self.page, self.model(self.demo.experiment1))
         return self.page.html(
             "Low-dimensional surface parameterisation: the paper, run again",
             lead,

@@ -151,6 +151,8 @@ class FolderPage:
         for fit in self.main:
             with suppress(ShapespaceError):  # the section of the fit states the reason
                 sections.order_pictures(self.page, self.staged(fit), self.others(fit))
+        with suppress(ShapespaceError):
+            sections.order_modes(self.page, self.model())
         return self.page.html(
             f"{counted(self.total, 'fit')} in {name}",
             [Text(lead)],

@@ -86,8 +86,8 @@ class Camera:
         if not len(points) or not np.isfinite(points).all():
             raise InputError("A camera needs at least one point to look at, and all of them finite.")
         axes = _view_axes(yaw_deg, pitch_deg)
-        projected = points @ axes.T
-        low, high = projected.min(axis=0), projected.max(axis=0)
+        projected = axes @ points.T
+        low, high = projected.min(axis=1), projected.max(axis=1)
         extent = high - low
         height = float(max(extent[1], extent[0] / aspect, 1e-6)) * (1 + 2 * margin)
         centre = ((low + high) / 2) @ axes
@@ -95,10 +95,9 @@ class Camera:
             return Camera(centre, height, yaw_deg, pitch_deg)
         distance = 5.0 * height + float(extent[2])
         # Nearer parts grow in perspective, so the height is that of the point which reaches farthest out.
-        offset = np.abs(projected - (low + high) / 2) * (
-            distance / (distance - (projected[:, 2:] - (low + high)[2] / 2))
-        )
-        half_height = max(float(offset[:, 1].max()), float(offset[:, 0].max()) / aspect, 1e-6)
+        x, y, z = projected - ((low + high) / 2)[:, None]
+        growth = distance / (distance - z)
+        half_height = max(float((np.abs(y) * growth).max()), float((np.abs(x) * growth).max()) / aspect, 1e-6)
         grown = 2 * half_height * (1 + 2 * margin)
         return Camera(centre, grown, yaw_deg, pitch_deg, distance)
 
