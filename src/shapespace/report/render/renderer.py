@@ -469,9 +469,7 @@ def _occlusion(
         sigma = radius_share * height / supersample
         weights = np.exp(-0.5 / sigma**2 * np.arange(int(2.5 * sigma + 0.5) + 1) ** 2)
         weights /= weights[0] + 2 * weights[1:].sum()
-        total, mean = (np.empty_like(depth) for _ in both)
-        for values, blurred in zip(both, (total, mean), strict=True):
-            blur(values, weights, blurred)
+        total, mean = (blur(values, weights) for values in both)
         mean /= np.maximum(total, np.float32(1e-6))
         around = mean.repeat(supersample, axis=0).repeat(supersample, axis=1).ravel()[pixel]
         depth_behind = np.clip(depth_mm - around, 0, max_depth * camera.height_mm)
@@ -479,46 +477,41 @@ def _occlusion(
     return out
 
 
-@compiled
-def blur(image: npt.NDArray[np.float32], weights: FloatArray, out: npt.NDArray[np.float32]) -> None:
-    """Blur an image by a symmetric separable filter; beyond its edges it is mirrored.
-
-    The inner loops run along rows, so that they are vectorised, unlike those of `scipy.ndimage`; results are equal.
+def blur(image: _Single, weights: FloatArray) -> _Single:
+    """Return an image blurred by a symmetric separable filter; beyond its edges it is mirrored.
 
     Args:
         image: (height, width).
         weights: (n,) weights at 0, 1, ... n - 1 pixels.
-        out: (height, width), written.
     """
-    height, width = image.shape
     reach = len(weights) - 1
-    total, line = np.empty(width), np.empty(width + 2 * reach)
-    for row in range(height):
-        total[:] = weights[0] * image[row]
-        for k in range(reach, 0, -1):
-            above, below = image[mirrored(row - k, height)], image[mirrored(row + k, height)]
-            weight = weights[k]
-            for column in range(width):
-                total[column] += (np.float64(above[column]) + np.float64(below[column])) * weight
-        out[row] = total
-    for row in range(height):
-        for column in range(-reach, width + reach):
-            line[column + reach] = out[row, mirrored(column, width)]
-        for column in range(width):
-            total[column] = weights[0] * line[column + reach]
-        for k in range(reach, 0, -1):
-            left, right = line[reach - k : reach - k + width], line[reach + k : reach + k + width]
-            weight = weights[k]
-            for column in range(width):
-                total[column] += (left[column] + right[column]) * weight
-        out[row] = total
+    for _ in range(2):
+        blurred = np.empty_like(image)
+        blur_columns(np.pad(image, ((reach, reach), (0, 0)), mode="symmetric"), weights, blurred)
+        image = np.ascontiguousarray(blurred.T)
+    return image
 
 
 @compiled
-def mirrored(index: int, count: int) -> int:
-    """Return the index in 0 ... `count` - 1 of a sequence that is mirrored at its ends again and again."""
-    index %= 2 * count
-    return index if index < count else 2 * count - 1 - index
+def blur_columns(image: npt.NDArray[np.float32], weights: FloatArray, out: npt.NDArray[np.float32]) -> None:
+    """Blur the columns of an image.
+
+    The inner loop runs along a row, so that it is vectorised, unlike that of `scipy.ndimage`; the result is equal.
+
+    Args:
+        image: (height + 2 (n - 1), width), with n - 1 rows beyond each edge.
+        weights: (n,) weights at 0, 1, ... n - 1 pixels.
+        out: (height, width), written.
+    """
+    reach = len(weights) - 1
+    total = np.empty(out.shape[1])
+    for row in range(out.shape[0]):
+        total[:] = weights[0] * image[row + reach]
+        for k in range(reach, 0, -1):
+            above, below, weight = image[row + reach - k], image[row + reach + k], weights[k]
+            for column in range(len(total)):
+                total[column] += (np.float64(above[column]) + np.float64(below[column])) * weight
+        out[row] = total
 
 
 _TINY = 1e-9  # pixels; keeps triangles that share an edge without gaps
