@@ -24,7 +24,7 @@ from tqdm import tqdm
 from shapespace.batch.fit_records import read_record
 from shapespace.batch.fit_work import FitJob
 from shapespace.batch.run import BatchConfig, FolderSink, fit_many, make_jobs
-from shapespace.batch.workers import DRAWING, Work, cores, deferred_calls, start_loading
+from shapespace.batch.workers import DRAWING, Work, deferred_calls
 from shapespace.datasets.faces import LICENSE, FaceGenerator, load_faces
 from shapespace.datasets.ict import ict_available, landmark_vertices, load_ict
 from shapespace.datasets.james import james_available, load_james
@@ -112,10 +112,8 @@ def run_demo(folder: Path, *, quick: bool = False, quiet: bool = False, scale: D
         bar.set_description(description)
         bar.update()
 
-    if cores() > 1:
-        start_loading(*DRAWING, notify=False)
     # Its products are short, so that more threads take twice as long, and their number would change last digits.
-    with bar, threadpool_limits(1, user_api="blas"), deferred_calls() as defer:
+    with bar, threadpool_limits(1, user_api="blas"), deferred_calls(*DRAWING) as defer:
         faces = load_faces()
         cases = _experiment_2(folder, faces, scale, step, defer)
         first = _experiment_1(folder, faces, scale, step, defer)
