@@ -9,31 +9,33 @@ from __future__ import annotations
 import platform
 import shutil
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, closing
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias, TypeVar, cast
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from shapespace.batch.executors import ExecutionConfig
 from shapespace.batch.fit_records import read_record
+from shapespace.batch.fit_work import FitJob
 from shapespace.batch.run import BatchConfig, FolderSink, fit_many, make_jobs
+from shapespace.batch.workers import DRAWING, Work, deferred_calls
 from shapespace.datasets.faces import LICENSE, FaceGenerator, load_faces
 from shapespace.datasets.ict import ict_available, landmark_vertices, load_ict
 from shapespace.datasets.james import james_available, load_james
 from shapespace.datasets.simulated_scan import Collar, Hair, Hole, SimulatedScan, random_similarity, simulate_scan
 from shapespace.fit.fit_scan import FitConfig
-from shapespace.fit.iteration_state import IcpState
 from shapespace.fit.paper.paper_method import Paper
 from shapespace.fit.robust.robust_method import Robust
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.files import make_folder, write_text
 from shapespace.io.meshes.mesh_io import write_mesh
+from shapespace.lazy import Defer, call_later
 from shapespace.model.shape_model import ShapeModel
 from shapespace.recognise.line_structure import disjointness, line_scores
 from shapespace.report.pages.write_html import require_report_extra, write_report
@@ -80,21 +82,9 @@ QUICK = DemoScale(triangles=30_000, stop_motion_mm=5e-2)
 """Scale of the quick demo: the counts of the paper, coarser scans, and fits that stop earlier."""
 
 
-class _Clock:
-    """A progress bar of the complete demo, hidden without a terminal, and the duration of each part in seconds."""
-
-    def __init__(self, total: int, *, quiet: bool) -> None:
-        self.bar = tqdm(total=total, unit="step", leave=False, disable=True if quiet else None)
-        self.seconds: dict[str, float] = {}
-        self._since = time.perf_counter()
-
-    def step(self, description: str) -> None:
-        self.bar.set_description(description)
-        self.bar.update()
-
-    def lap(self, part: str) -> None:
-        before, self._since = self._since, time.perf_counter()
-        self.seconds[part] = self._since - before
+T = TypeVar("T")
+R = TypeVar("R")
+_Step: TypeAlias = Callable[[str], None]  # called with the description of a finished step
 
 
 def run_demo(folder: Path, *, quick: bool = False, quiet: bool = False, scale: DemoScale | None = None) -> Path:
@@ -115,14 +105,19 @@ def run_demo(folder: Path, *, quick: bool = False, quiet: bool = False, scale: D
     make_folder(folder)
     for part in ("experiment1", "experiment2"):
         shutil.rmtree(folder / part, ignore_errors=True)
-    clock = _Clock(17 + 4 + 4 + 3, quiet=quiet)
+    begin = time.perf_counter()
+    bar = tqdm(total=17 + 2 + 3 + 1, unit="step", leave=False, disable=True if quiet else None)
+
+    def step(description: str) -> None:
+        bar.set_description(description)
+        bar.update()
+
     # Its products are short, so that more threads take twice as long, and their number would change last digits.
-    with clock.bar, threadpool_limits(1, user_api="blas"):
+    with bar, threadpool_limits(1, user_api="blas"), deferred_calls(*DRAWING) as defer:
         faces = load_faces()
-        first = _experiment_1(folder, faces, scale, clock)
-        clock.lap("experiment1")
-        second = _experiment_2(folder, faces, scale, clock)
-        clock.lap("experiment2")
+        cases = _experiment_2(folder, faces, scale, step, defer)
+        first = _experiment_1(folder, faces, scale, step, defer)
+        second = ManyPeople(folder="experiment2", cases=tuple(case() for case in cases))
         demo = Demo(
             version=__version__,
             quick=quick,
@@ -131,17 +126,17 @@ def run_demo(folder: Path, *, quick: bool = False, quiet: bool = False, scale: D
             versions=_versions(("numpy", "scipy", "h5py", "libigl", "matplotlib")),
             seed=_SEED,
             settings=asdict(scale),
-            seconds={**clock.seconds, "total": sum(clock.seconds.values())},
+            seconds={"total": time.perf_counter() - begin},
             experiment1=first,
             experiment2=second,
             paper_table=tuple(_paper_table(folder, first, second)),
         )
         write_text(folder / "demo.json", json_text(demo))
-        clock.step("report")
-        return write_report(folder)
+        step("report")
+        return write_report(folder, defer=defer)
 
 
-def _experiment_1(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _Clock) -> ExpressionsOfOne:
+def _experiment_1(folder: Path, faces: FaceGenerator, scale: DemoScale, step: _Step, defer: Defer) -> ExpressionsOfOne:
     """Run experiment 1: fit a model of 100 mixed expressions of one person to 16 new expressions and a neutral face."""
     rng = np.random.default_rng(_SEED)
     home = make_folder(folder / "experiment1")
@@ -159,19 +154,23 @@ def _experiment_1(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _
     n_modes = everything.modes_for_variance(_PAPER_VARIANCE)
     model = everything.truncate(n_modes or everything.n_modes)
     model.save(home / "model.h5")
-    clock.step("model of expressions")
+    step("model of expressions")
 
     cases = [("neutral", 0.0), *((name, level) for name in PAPER_EXPRESSIONS for level in scale.levels)]
-    scans: dict[str, SimulatedScan] = {}
-    labels: dict[str, tuple[str, float]] = {}
-    for expression, level in cases:
-        name = expression if expression == "neutral" else f"{expression}_{round(100 * level):03}"
-        truth = faces.face(person, faces.draw_expression(expression, level, rng), name=name)
-        pose = random_similarity(rng, max_angle_deg=20.0, scale_range=(0.9, 1.1), translation_mm=100.0)
-        scans[name] = simulate_scan(truth, rng, triangles=scale.triangles, noise_mm=0.2, T_scan_model=pose, name=name)
-        labels[name] = (expression, level)
-    fits = _fit_all(home, model, scans, labels, _paper_config(scale), clock)
+    labels = {
+        expression if expression == "neutral" else f"{expression}_{round(100 * level):03}": (expression, level)
+        for expression, level in cases
+    }
 
+    def simulated() -> Iterator[SimulatedScan]:
+        for name, (expression, level) in labels.items():
+            truth = faces.face(person, faces.draw_expression(expression, level, rng), name=name)
+            pose = random_similarity(rng, max_angle_deg=20.0, scale_range=(0.9, 1.1), translation_mm=100.0)
+            yield simulate_scan(truth, rng, triangles=scale.triangles, noise_mm=0.2, T_scan_model=pose, name=name)
+
+    fits = _fit_all(home, model, simulated(), labels, _paper_config(scale), defer, step)
+
+    assert model.training is not None
     make_folder(home / "training")
     examples: list[Example] = []
     for mesh in training[:12]:
@@ -187,7 +186,9 @@ def _experiment_1(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _
         modes_for_98_5=n_modes,
         cumulative_variance=tuple(everything.cumulative_variance[:20].tolist()),
         training_examples=tuple(examples),
-        population_z=tuple(tuple((model.project(mesh) / model.stddev).round(4).tolist()) for mesh in training),
+        population_z=tuple(
+            tuple(z) for z in (model.training.coefficients[:, : model.n_modes] / model.stddev).round(4).tolist()
+        ),
         fits=tuple(fits),
         scores=_scores(folder, fits),
     )
@@ -218,8 +219,10 @@ def _record(folder: Path, fit: FitEntry) -> FitRecord:
     return read_record(folder / str(fit.json))
 
 
-def _experiment_2(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _Clock) -> ManyPeople:
-    """Run experiment 2: fit a model of 100 neutral faces to scans of other people."""
+def _experiment_2(
+    folder: Path, faces: FaceGenerator, scale: DemoScale, step: _Step, defer: Defer
+) -> list[Callable[[], Case]]:
+    """Start experiment 2, fits of a model of 100 neutral faces to scans of other people; return waits for its cases."""
     rng = np.random.default_rng(_SEED + 1)
     home = make_folder(folder / "experiment2")
     people = [faces.face(faces.draw_person(rng), name=f"person_{i:03}") for i in range(scale.training)]
@@ -231,7 +234,7 @@ def _experiment_2(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _
         provenance=f"{scale.training} simulated people, neutral",
         licence=LICENSE,
     )
-    clock.step("model of people")
+    step("model of people")
     stranger = faces.face(faces.draw_person(rng), name="stranger")
     pose = random_similarity(rng, max_angle_deg=20.0, scale_range=(0.95, 1.05), translation_mm=100.0)
     simulated = simulate_scan(
@@ -262,7 +265,7 @@ def _experiment_2(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _
             note = "A real scan with hair and collar; the model consists of statistics of real people."
             title = "James, a real 3dMD scan, with a model of ICT-FaceKit people"
             story.append(_Story("ict", _ict_model(scale), james, title, "James, ICT model", note))
-            clock.step("model of ICT people")
+            step("model of ICT people")
         main_modes = bundled.truncate(bundled.modes_for_variance(_MAIN_MODES_SHARE) or bundled.n_modes)
         title = "James, a real 3dMD scan, with the bundled model"
         note = (
@@ -270,7 +273,7 @@ def _experiment_2(folder: Path, faces: FaceGenerator, scale: DemoScale, clock: _
             "covers, and is restricted to the modes with 90 % of its variance."
         )
         story.append(_Story("bundled_main", main_modes, james, title, "James, bundled model", note))
-    return ManyPeople(folder="experiment2", cases=tuple(_case(home, entry, scale, clock) for entry in story))
+    return [defer(_case, home, entry, scale) for entry in story]
 
 
 def _ict_model(scale: DemoScale) -> ShapeModel:
@@ -298,7 +301,7 @@ class _Story:
     note: str
 
 
-def _case(home: Path, story: _Story, scale: DemoScale, clock: _Clock) -> Case:
+def _case(home: Path, story: _Story, scale: DemoScale) -> Case:
     """Fit a scan of experiment 2 and return its entry."""
     model, file = story.model, f"{story.model_name}_model.h5"
     if not (home / file).exists():
@@ -310,10 +313,9 @@ def _case(home: Path, story: _Story, scale: DemoScale, clock: _Clock) -> Case:
         _fit_all(
             home=home,
             model=model,
-            scans={name: story.scan},
+            scans=iter([story.scan]),
             labels={name: ("neutral", 0.0)},
             config=config,
-            clock=clock,
             model_name=file,
         )[0]
         for name, config in ((name, paper), (f"{name}_robust", FitConfig(Robust())))
@@ -342,31 +344,25 @@ def _paper_config(scale: DemoScale) -> FitConfig:
 def _fit_all(
     home: Path,
     model: ShapeModel,
-    scans: Mapping[str, SimulatedScan | Mesh],
+    scans: Iterator[SimulatedScan | Mesh],
     labels: Mapping[str, tuple[str, float]],
     config: FitConfig,
-    clock: _Clock,
+    defer: Defer = call_later,
+    step: _Step = lambda _: None,
     model_name: str = "model.h5",
 ) -> list[FitEntry]:
-    """Write `scans` as files, fit them like the command line, and return an entry for each scan."""
-    make_folder(home / "scans")
-    for name, scan in scans.items():
-        write_mesh(home / "scans" / f"{name}.ply", scan.scan if isinstance(scan, SimulatedScan) else scan)
-
-    def show(state: IcpState) -> None:
-        clock.bar.set_postfix_str(f"phase {state.phase}, iteration {state.iteration}, RMS {state.rms_mm:.2f} mm")
-
+    """Write `scans`, named as in `labels`, as files, fit them like the command line, and return an entry for each."""
+    fits = _FitsOfNewScans(make_folder(home / "scans"), scans, defer)
     sink = FolderSink(home / "fits")
     fit_many(
-        make_jobs([home / "scans" / f"{name}.ply" for name in scans]),
+        make_jobs([home / "scans" / f"{name}.ply" for name in labels]),
         BatchConfig(model, home / model_name, config, stages=True),
-        ExecutionConfig().executor(len(scans)),
+        fits,
         sink,
-        on_done=lambda job, _: clock.step(f"fitted {job.name}"),
-        on_state=show,
+        on_done=lambda job, _: step(f"fitted {job.name}"),
     )
     entries: list[FitEntry] = []
-    for name, scan in scans.items():
+    for name, scan in zip(labels, fits.written, strict=True):
         record = sink.records[name]
         base, fitted = f"{home.name}/fits/{name}", record.is_fitted
         errors: dict[str, VertexErrors] = {}
@@ -389,6 +385,35 @@ def _fit_all(
             )
         )
     return entries
+
+
+@dataclass(frozen=True)
+class _FitsOfNewScans:
+    """Executor that writes the file of each scan when its fit is due, so that fits run while scans are simulated.
+
+    Args:
+        folder: folder of the files.
+        scans: scans in the order of the fits.
+        defer: function that starts a fit.
+    """
+
+    folder: Path
+    scans: Iterator[SimulatedScan | Mesh]
+    defer: Defer
+    written: list[SimulatedScan | Mesh] = field(default_factory=list[SimulatedScan | Mesh])
+
+    def run(self, work: Work[T, R], tasks: Sequence[T], /) -> AbstractContextManager[Iterator[tuple[T, R]]]:
+        """As `Executor.run`; the tasks are `FitTask`s."""
+        return closing(self._answers(work, tasks))
+
+    def _answers(self, work: Work[T, R], tasks: Sequence[T]) -> Generator[tuple[T, R]]:
+        answers: list[Callable[[], R]] = []
+        for task, scan in zip(tasks, self.scans, strict=True):
+            job: FitJob = cast(Any, task).job
+            write_mesh(job.scan, scan.scan if isinstance(scan, SimulatedScan) else scan)
+            self.written.append(scan)
+            answers.append(self.defer(work.do, task))
+        yield from ((task, answer()) for task, answer in zip(tasks, answers, strict=True))
 
 
 def _vertex_error(vertices: FloatArray, scan: SimulatedScan) -> VertexErrors:

@@ -1,4 +1,4 @@
-"""Lazy imports of functions in higher layers, and of optional packages.
+"""Lazy imports of functions in higher layers, and of optional packages; calls that are made later.
 
 Modules import only from lower layers. Methods of models and results, such as plots, nevertheless need functions of
 higher layers, which they find in `LAZY_FUNCTIONS`, the complete list of these exceptions.
@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, Protocol, overload
+from typing import Any, Literal, ParamSpec, Protocol, TypeVar, overload
 
 from shapespace.errors import ShapespaceError
 
@@ -117,3 +118,20 @@ def require_package(module: str, purpose: str, install: str = "") -> Any:
         else:
             cause = f"which is installed but cannot be loaded ({error}); see its installation instructions."
         raise ShapespaceError(f"{purpose} needs {package}, {cause}") from error
+
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+class Defer(Protocol):
+    """Starts a call, perhaps in another process, to which function, arguments and result can be sent."""
+
+    def __call__(self, function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Callable[[], T]:
+        """Return a function that waits for the result of the call, or raises its error."""
+        ...
+
+
+def call_later(function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Callable[[], T]:
+    """Return a function that makes a call in this process."""
+    return partial(function, *args, **kwargs)

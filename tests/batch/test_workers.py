@@ -16,6 +16,7 @@ from shapespace.batch import workers
 from shapespace.batch.progress import telling_of_compiling
 from shapespace.batch.warm import COMPILING
 from shapespace.compiled import notify_compilation
+from shapespace.errors import InputError
 
 LINUX = pytest.mark.skipif(sys.platform != "linux", reason="workers are copies of a server on Linux alone")
 STATE = """
@@ -146,3 +147,31 @@ def test_compiling_is_told_in_a_log_too_unless_asked_not_to(capsys: pytest.Captu
 def fresh() -> Callable[[float], float]:
     """Return a loop that no cache has."""
     return cast(Any, numba).njit(lambda x: x + 1.0)
+
+
+def _end_in_another_process(here: int) -> str:
+    if os.getpid() != here:
+        os._exit(1)
+    return "made here"
+
+
+def _process() -> int:
+    return os.getpid()
+
+
+def _fail() -> None:
+    raise InputError("This is wrong.")
+
+
+def test_deferred_calls_are_made_elsewhere_or_here_and_raise_their_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "cores", lambda: 2)
+    with workers.deferred_calls() as defer:
+        waits, error = [defer(_process) for _ in range(3)], defer(_fail)
+        assert os.getpid() not in [wait() for wait in waits]
+        with pytest.raises(InputError, match="wrong"):
+            error()
+        assert defer(_end_in_another_process, os.getpid())() == "made here"
+        assert defer(_process)() == os.getpid()  # no process is left
+    monkeypatch.setattr(workers, "cores", lambda: 1)
+    with workers.deferred_calls() as defer:
+        assert defer(_process)() == os.getpid()

@@ -642,3 +642,17 @@ def test_a_few_values_are_dots_and_no_histogram(count: int, bars: bool) -> None:
     assert any(axes.patches for axes in matrix.axes) == bars
     drawn = sum(len(np.asarray(line.get_xdata())) for axes in matrix.axes for line in axes.lines)
     assert bars or drawn == 2 * count
+
+
+def test_pictures_are_copied_as_matplotlib_draws_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    panels = [rng.integers(0, 255, (61, 47, 3)).astype(np.uint8) for _ in range(3)]
+
+    def pixels() -> np.ndarray:
+        canvas = FigureCanvasAgg(draw.grid([draw.Row(panels, ["a", "b", "c"])], title="Three", note="all"))
+        canvas.draw()
+        return np.array(canvas.buffer_rgba())
+
+    copied = pixels()
+    monkeypatch.delattr(draw._Panel, "make_image")
+    np.testing.assert_array_equal(pixels(), copied)

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from report_page import Page, edit
 
+from shapespace.batch.workers import DRAWING, deferred_calls
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.tables.table_io import write_rows
 from shapespace.report.pages import folder_page
@@ -38,6 +39,12 @@ def page(fits_template: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
     assert write_report(fits_template / "out", path, on_step=lambda *step: steps.append(step)) == path
     assert 0.5 * steps[0][1] <= len(steps) <= 1.5 * steps[0][1]
     return path.read_text(encoding="utf-8")
+
+
+def test_pictures_drawn_by_other_processes_are_the_same(fits_template: Path, page: str, tmp_path: Path) -> None:
+    with deferred_calls(*DRAWING) as defer:
+        path = write_report(fits_template / "out", tmp_path / "it.html", defer=defer)
+    assert path.read_text(encoding="utf-8") == page
 
 
 def test_every_part_is_there_in_order_and_none_is_broken(page: str) -> None:

@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from shapespace.errors import InputError
-from shapespace.report.render.renderer import Camera, Layer, render, render_series, visible_triangles
+from shapespace.report.render.renderer import Camera, Layer, blur, render, render_series, visible_triangles
 from shapespace.types import FloatArray, Mesh
 
 SIZE = (57, 43)
@@ -26,6 +27,15 @@ def ball(radius: float = 10.0, n: int = 24) -> Mesh:
     i = np.arange(n * 2 * n).reshape(n, 2 * n)
     a, b, c, d = i[:-1, :-1].ravel(), i[1:, :-1].ravel(), i[1:, 1:].ravel(), i[:-1, 1:].ravel()
     return Mesh(points, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]))
+
+
+@pytest.mark.parametrize("sigma", [0.2, 0.7, 3.1, 12.0])
+@pytest.mark.parametrize("shape", [(1, 1), (5, 9), (40, 31)])
+def test_blurs_are_those_of_scipy(sigma: float, shape: tuple[int, int]) -> None:
+    image = np.random.default_rng(0).normal(100, 10, shape).astype(np.float32)
+    weights = np.exp(-0.5 / sigma**2 * np.arange(int(2.5 * sigma + 0.5) + 1) ** 2)
+    blurred = blur(image, weights / (weights[0] + 2 * weights[1:].sum()))
+    np.testing.assert_allclose(blurred, gaussian_filter(image, sigma, truncate=2.5), rtol=1e-6)
 
 
 def brute_force(mesh: Mesh, camera: Camera) -> tuple[np.ndarray, np.ndarray]:

@@ -23,14 +23,17 @@ from dataclasses import dataclass
 from importlib import import_module
 from multiprocessing.connection import wait
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ParamSpec, Protocol, TypeVar, cast
 
 from shapespace.errors import FitError
+from shapespace.lazy import Defer, call_later
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
     from multiprocessing.context import ForkServerContext, SpawnContext
 
+P = ParamSpec("P")
+T = TypeVar("T")
 TaskT = TypeVar("TaskT", contravariant=True)
 AnswerT = TypeVar("AnswerT", covariant=True)
 
@@ -86,6 +89,8 @@ WARM_UP = "SHAPESPACE_WARM_UP"
 COPIED = sys.platform == "linux"
 """Whether workers are copies of one server. Apple's BLAS does not support fork, and Windows has no fork."""
 _WARM = "shapespace.batch.warm"  # loads the code of a fit; imports this module
+DRAWING = ("shapespace.report.pages.page", "shapespace.report.figures.fit_figures")
+"""Modules of processes that draw figures of fits."""
 _BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -99,17 +104,18 @@ def context() -> ForkServerContext | SpawnContext:
     return multiprocessing.get_context("forkserver") if COPIED else multiprocessing.get_context("spawn")
 
 
-def start_loading(*, notify: bool) -> None:
+def start_loading(*modules: str, notify: bool) -> None:
     """Load the code of the workers in the background; for workers that are new processes, compile it if needed.
 
     Args:
+        modules: names of further modules of the workers.
         notify: whether a line on standard error may state that the code is being compiled.
     """
     mark = share_mark() if notify else remove_mark()
     if not COPIED:
         import_module(_WARM).warm_up(notify=notify)
         return
-    preload((_WARM,), {WARM_UP: "notify" if notify else "quiet", MARK: mark})
+    preload((_WARM, *modules), {WARM_UP: "notify" if notify else "quiet", MARK: mark})
 
 
 def preload(modules: Sequence[str], environment: Mapping[str, str] | None = None) -> None:
@@ -137,6 +143,52 @@ def preload(modules: Sequence[str], environment: Mapping[str, str] | None = None
                 del os.environ[name]
             else:
                 os.environ[name] = value
+
+
+@contextlib.contextmanager
+def deferred_calls(*modules: str) -> Generator[Defer]:
+    """Yield a function that starts calls in other processes, one per core, which end at the end of the block.
+
+    A process that ends early, as for want of memory, leaves its calls to this process, as does a single core.
+
+    Args:
+        modules: names of modules of the calls, which are imported in the background.
+    """
+    if cores() < 2:
+        yield call_later
+        return
+    from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
+
+    def defer(function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Callable[[], T]:
+        try:
+            future = pool.submit(function, *args, **kwargs)
+        except (BrokenExecutor, EOFError, OSError):
+            return call_later(function, *args, **kwargs)
+
+        def wait_for_result() -> T:
+            try:
+                return future.result()
+            except BrokenExecutor:
+                return function(*args, **kwargs)
+
+        return wait_for_result
+
+    preload(modules)
+    with life_line() as life:
+        pool = ProcessPoolExecutor(cores(), context(), initializer=_start_in_pool, initargs=(life,))
+        try:
+            yield defer
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _start_in_pool(life: Connection) -> None:
+    """Ignore Ctrl-C, end with the life line, and use one core."""
+    from threadpoolctl import threadpool_limits
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    end_after(lambda: life.poll(None))
+    threadpool_limits(1)
 
 
 def wait_until_loaded() -> None:

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from shapespace.batch.progress import progress, waiting
+from shapespace.batch.workers import DRAWING, deferred_calls
 from shapespace.commands.outcome import Outcome
 from shapespace.errors import InputError, ShapespaceError
-from shapespace.report.analyses.analysis_report import AnalysisReport
+from shapespace.lazy import call_later
 from shapespace.schemas import to_json
+
+if TYPE_CHECKING:
+    from shapespace.report.analyses.analysis_report import AnalysisReport
 
 
 def write_answer(report: AnalysisReport, output: Path, *, quiet: bool) -> Outcome:
@@ -79,10 +84,15 @@ def write_report(folder: Path, output: Path | None, *, model: Path | None, label
         InputError: the folder contains no results, or `model` is not of its fits.
         ShapespaceError: the extra `report` is not installed.
     """
-    from shapespace.report.pages import write_html as html
+    with ExitStack() as stack:
+        # Before the imports of this process, which take as long as those of the others.
+        defer = call_later
+        if any(folder.glob("*.fit.json")) or (folder / "demo.json").is_file():
+            defer = stack.enter_context(deferred_calls(*DRAWING))
+        step = stack.enter_context(drawing(quiet=quiet))
+        from shapespace.report.pages import write_html as html
 
-    with drawing(quiet=quiet) as step:
-        return html.write_report(folder, output, model=model, labels=labels, on_step=step)
+        return html.write_report(folder, output, model=model, labels=labels, on_step=step, defer=defer)
 
 
 @contextmanager

@@ -6,6 +6,8 @@ import inspect
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from itertools import product
 from math import nan
 from types import MappingProxyType
@@ -50,7 +52,7 @@ from shapespace.report.blocks.wording import (
     words,
 )
 from shapespace.report.inputs.saved_fits import Direction, Folder, Measure, SavedFit, StagedFit, measured_mm
-from shapespace.report.pages.page import Page
+from shapespace.report.pages.page import OrderedPicture, Page
 from shapespace.report.render import thumbnails
 from shapespace.report.render.scene import pack_fit, pack_model, pack_scatter, pack_surfaces
 from shapespace.schemas import Quality, VertexErrors, read
@@ -65,6 +67,7 @@ SCAN_TRIANGLES = 8_000
 
 _From = TypeVar("_From")
 _To = TypeVar("_To")
+_MODES_DRAWN = 5  # rows of the picture of the modes
 _CAPTION_HEIGHT = 0.14
 """Height of the caption of a figure, as a share of the figure's width."""
 _DETAIL_BYTES = 1_300_000  # bytes of the page that all pictures of one fit take
@@ -121,7 +124,7 @@ def model_part(page: Page, model: ShapeModel, *, figure_of: str = "", to_move: i
         ("Provenance", model.provenance),
         ("Licence", model.licence or "not stated"),
     ]
-    n_shown = min(5, model.n_modes)
+    n_shown = min(_MODES_DRAWN, model.n_modes)
     return [
         modes_to_move(page, model, to_move),
         Facts(rows, "The shape model"),
@@ -130,7 +133,7 @@ def model_part(page: Page, model: ShapeModel, *, figure_of: str = "", to_move: i
             [
                 in_columns(
                     page.figure(
-                        figures.modes_figure(model, modes=n_shown),
+                        order_modes(page, model),
                         f"{figure_of}Each row: the mean with one mode at −3, 0 and +3 standard deviations, and how far "
                         "each point moves at 3. One scale for all rows.",
                         alt=f"Mean shape and the first {counted(n_shown, 'mode')} at minus and plus three standard "
@@ -152,6 +155,16 @@ def model_part(page: Page, model: ShapeModel, *, figure_of: str = "", to_move: i
             ],
         ),
     ]
+
+
+def order_modes(page: Page, model: ShapeModel) -> OrderedPicture:
+    """Order the picture of the first modes of a model once, as early as possible."""
+
+    def order() -> OrderedPicture:
+        drawn = replace(model, training=None)  # which may be large, and is not drawn
+        return page.order(partial(figures.modes_figure, drawn, modes=min(_MODES_DRAWN, model.n_modes)), chart=False)
+
+    return page.once(("modes", model), order)
 
 
 def quality_part(page: Page, folder: Folder) -> Figure:
@@ -213,6 +226,7 @@ def fit_in_full(
     """
     if page.left < _DETAIL_BYTES + reserve:
         return [Text("Its pictures would make this file larger than 8 MB, so they are omitted.", "soft")]
+    order_pictures(page, fit, population)
     turning = page.tried(lambda: fit_to_turn(page, fit))
     pictures = fit_pictures(page, fit, population, of_paper=of_paper)
     stages, iterations = ("", "") if fit.regions is None else ("stages, ", "iterations, ")
@@ -273,6 +287,25 @@ def share_within(fit: StagedFit, limit_mm: float) -> str:
     return percent(float((known <= limit_mm).mean())) if len(known) else "none"
 
 
+def order_pictures(page: Page, fit: StagedFit, population: FloatArray | None) -> Mapping[str, OrderedPicture]:
+    """Order all pictures of one fit, as early as possible, and return them by the names of their functions.
+
+    Args:
+        page: page of the pictures.
+        fit: fit with its stages; pictures of the same object are ordered once.
+        population: (N, K) coefficients of other fits in standard deviations, or None.
+    """
+    names = [name for name in _CAPTIONS if fit.regions is not None or name not in _OF_STAGES]
+    options: Mapping[str, Any] = {"coefficients_figure": {"population": population}}
+    return page.once(
+        ("pictures", fit),
+        lambda: {
+            name: page.order(partial(getattr(figures, name), fit, **options.get(name, {})), chart=name in _CHARTS)
+            for name in names
+        },
+    )
+
+
 def fit_pictures(page: Page, fit: StagedFit, population: FloatArray | None, *, of_paper: bool) -> Block:
     """Return all pictures of one fit for `fit_in_full`."""
     stages = {"before": "before", "initial": "after phase 1", "final": "after phase 2", "dense": "dense"}
@@ -296,26 +329,23 @@ def fit_pictures(page: Page, fit: StagedFit, population: FloatArray | None, *, o
         "coefficients_figure": f"Coefficients of {fit.label}: " + ", ".join(f"{value:.1f}" for value in fit.z[:10]),
     }
 
-    def picture(name: str, alt: str) -> Figure:
-        return page.figure(
-            getattr(figures, name)(fit, **({"population": population} if name == "coefficients_figure" else {})),
-            ((_OF_PAPER.get(name, "") if of_paper else "") + _CAPTIONS[name]),
-            alt=alt,
-            chart=name in ("history_figure", "coefficients_figure"),
-        )
+    def picture(name: str, ordered: OrderedPicture) -> Figure:
+        caption = (_OF_PAPER.get(name, "") if of_paper else "") + _CAPTIONS[name]
+        return page.figure(ordered, caption, alt=alts[name], chart=name in _CHARTS)
 
     return in_columns(
         *(
             block
-            for name, alt in alts.items()
-            if fit.regions is not None or name not in _OF_STAGES
-            for block in page.tried(lambda name=name, alt=alt: picture(name, alt))
+            for name, ordered in order_pictures(page, fit, population).items()
+            for block in page.tried(lambda name=name, ordered=ordered: picture(name, ordered))
         )
     )
 
 
 _OF_STAGES = ("stages_figure", "regions_figure", "history_figure")
 """Figures that need the output of --stages."""
+_CHARTS = ("history_figure", "coefficients_figure")
+"""Figures of few colours, which are smaller without loss."""
 _CAPTIONS = {
     "stages_figure": "The scan, and the model at each stage of the fit, in the frame of the final pose.",
     "overlay_figure": "Scan and model over each other, the nearer one shown: where they alternate finely, they "

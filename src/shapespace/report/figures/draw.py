@@ -32,7 +32,7 @@ from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.image import BboxImage
-from matplotlib.transforms import Bbox, TransformedBbox
+from matplotlib.transforms import Bbox, IdentityTransform, TransformedBbox
 
 from shapespace.errors import InputError
 from shapespace.io.files import write_bytes
@@ -274,6 +274,20 @@ def grid(
     return figure
 
 
+class _Panel(BboxImage):
+    """A picture in a figure; where one of its pixels is one of the figure, it is not resampled, which takes longer."""
+
+    def make_image(self, renderer: Any, magnification: float = 1.0, unsampled: bool = False) -> Any:
+        """As `BboxImage.make_image`: pixels from the bottom upwards with opacity, and the place of the lowest row."""
+        picture: Image = cast(Any, self)._A
+        place = self.get_window_extent(renderer)
+        if magnification != 1 or (round(place.height), round(place.width)) != picture.shape[:2]:
+            return super().make_image(renderer, magnification, unsampled)
+        pixels = np.full((*picture.shape[:2], 4), 255, dtype=np.uint8)
+        pixels[:, :, :3] = picture[::-1]
+        return pixels, place.x0, place.y0, IdentityTransform()
+
+
 def _compose(
     pictures: Sequence[tuple[float, float, Image]],
     texts: Sequence[tuple[float, float, str, dict[str, Any]]],
@@ -287,7 +301,7 @@ def _compose(
         high, wide = (side / LAYOUT.get().panel_scale for side in image.shape[:2])
         place = Bbox.from_bounds(x / total_w, 1 - (round(top) + high) / total_h, wide / total_w, high / total_h)
         # Axes, with their ticks, would take several times as long.
-        panel = BboxImage(TransformedBbox(place, figure.transFigure), interpolation="nearest")
+        panel = _Panel(TransformedBbox(place, figure.transFigure), interpolation="nearest")
         panel.set_data(image)
         figure.add_artist(panel)
     for x, top, text, style in texts:
@@ -461,7 +475,7 @@ def encode_webp(figure: Figure, *, lossless: bool = False) -> Still:
         np.asarray(canvas.buffer_rgba())[:, :, :3],
         lossless=lossless,
         quality=20 if lossless else 78,
-        effort=1 if lossless else 3,
+        effort=1 if lossless else 2,
     )
 
 

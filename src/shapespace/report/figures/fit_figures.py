@@ -256,7 +256,7 @@ def distance_histograms(fit: StagedFit, *, title: str = "", bins: int = 60) -> F
                 bbox={"facecolor": "white", "lw": 0, "pad": 1.5},
             )  # fmt: skip
         axes.axhline(0, color=GREY, lw=0.8)
-        axes.set_title(STAGE_WORDS.get(stage, stage), fontsize=type_size(TEXT), color=INK, loc="left", pad=4)
+        axes.set_title(STAGE_WORDS.get(stage, stage), fontsize=type_size(TEXT), color=INK, loc="left", pad=4, y=1.0)
         axes.set(xscale="log", xlim=(low, high), ylim=(-axis_top, axis_top))
         axes.yaxis.set_major_locator(MaxNLocator(3, symmetric=True))
         axes.yaxis.set_major_formatter(lambda value, _: f"{abs(value):g}")

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
-from shapespace.errors import FileFormatError
+from shapespace.errors import FileFormatError, ShapespaceError
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report import figures
 from shapespace.report.blocks import sections
@@ -17,6 +18,7 @@ from shapespace.report.blocks.wording import DASH, STATUS_WORDS, isfinite, mm, m
 from shapespace.report.inputs.saved_fits import Folder, SavedFit, StagedFit, read_fit, staged_fit
 from shapespace.report.pages.page import Chapter, Make, Page
 from shapespace.schemas import DEMO_AGAIN, Case, Demo, DemoModel, ExpressionsOfOne, FitEntry, read
+from shapespace.types import FloatArray
 
 _RESERVE_BYTES = 1_200_000  # bytes that stay free for the parts after the fits
 _PICTURES = 30  # planned pictures, for the progress bar alone
@@ -58,6 +60,11 @@ class DemoPage:
                 "soft",
             ),
         ]
+        for fit, label, population_z in self.in_full():
+            with suppress(ShapespaceError):  # the section of the fit states the reason
+                sections.order_pictures(self.page, self.staged(fit, label), _coefficients(population_z))
+        with suppress(ShapespaceError):
+            sections.order_modes(self.page, self.model(self.demo.experiment1))
         return self.page.html(
             "Low-dimensional surface parameterisation: the paper, run again",
             lead,
@@ -83,7 +90,21 @@ class DemoPage:
     def staged(self, fit: SavedFit, label: str = "") -> StagedFit:
         """Return the surfaces of `fit` for its pictures, with the name `label`."""
         staged = self.page.once(("stages", str(fit.entry.stages)), lambda: staged_fit(self.folder, fit))
-        return replace(staged, label=label or fit.label)
+        label = label or fit.label
+        return self.page.once(("labelled", staged, label), lambda: replace(staged, label=label))
+
+    def in_full(self) -> list[tuple[SavedFit, str, Sequence[Sequence[float]]]]:
+        """Return the fits with all pictures: their labels, and the coefficients of the population of their models."""
+        experiment = self.demo.experiment1
+        farthest = sorted(
+            (fit for fit in _tests(self.readable(experiment.fits)[0]) if fit.pictured),
+            key=lambda fit: -np.nan_to_num(fit.summary_mm("before", "model_to_scan", "max")),
+        )
+        cases = [(fit, _short(case)) for case in self.cases for fit in self.readable([case.fit])[0] if fit.pictured]
+        return [
+            *((fit, fit.label, experiment.population_z) for fit in farthest[: 1 if self.demo.quick else 2]),
+            *((fit, label, ()) for fit, label in cases),
+        ]
 
     def model(self, owner: DemoModel) -> ShapeModel:
         """Return the model of an experiment or a case."""
@@ -211,10 +232,7 @@ class DemoPage:
             raise FileFormatError("demo.json contains no experiment 1; run the demo again.")
         fits, problems = self.readable(experiment.fits)
         tests = _tests(fits)
-        farthest = sorted(
-            (fit for fit in tests if fit.pictured),
-            key=lambda fit: -np.nan_to_num(fit.summary_mm("before", "model_to_scan", "max")),
-        )
+        farthest = [item for item in self.in_full() if item[0] in tests]
         intro = (
             f"{experiment.title or 'Expressions of one person'}: {_count(experiment.n_training)} faces of one "
             f"simulated person make the model, {_count(experiment.modes_for_98_5)} modes contain 98.5 % of their "
@@ -226,11 +244,7 @@ class DemoPage:
             "Mean and first modes": lambda: self.modes(experiment, "Paper, figures 2 and 3. "),
             "The test faces": lambda: self.test_faces(tests),
             "From far away, step by step": lambda: (
-                [
-                    block
-                    for fit in farthest[: 1 if self.demo.quick else 2]
-                    for block in self.one_fit(fit, fit.label, experiment.population_z)
-                ]
+                [block for fit, label, population_z in farthest for block in self.one_fit(fit, label, population_z)]
                 or [_NOTHING]
             ),
             "Test faces, fitted": lambda: self.all_fitted(tests),
@@ -281,12 +295,10 @@ class DemoPage:
 
     def one_fit(self, fit: SavedFit, label: str, population_z: Sequence[Sequence[float]] = ()) -> list[Block]:
         """Return one fit with all its pictures, and its coefficients compared with those of the population (N, K)."""
-        if len({len(z) for z in population_z}) > 1:
-            raise FileFormatError("population_z in demo.json has rows of different lengths; run the demo again.")
         return sections.fit_in_full(
             self.page,
             self.staged(fit, label),
-            (np.array(population_z, dtype=np.float64) if population_z else None),
+            _coefficients(population_z),
             reserve=_RESERVE_BYTES,
             of_paper=True,
         )
@@ -430,6 +442,12 @@ class DemoPage:
 
 def _tests(fits: Sequence[SavedFit]) -> list[SavedFit]:
     return [fit for fit in fits if fit.entry.intensity]
+
+
+def _coefficients(population_z: Sequence[Sequence[float]]) -> FloatArray | None:
+    if len({len(z) for z in population_z}) > 1:
+        raise FileFormatError("population_z in demo.json has rows of different lengths; run the demo again.")
+    return np.array(population_z, dtype=np.float64) if population_z else None
 
 
 def _strongest(pictured: Sequence[tuple[SavedFit, StagedFit]]) -> list[StagedFit]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -147,6 +148,11 @@ class FolderPage:
         """Return the page."""
         lead = "Fits of a statistical shape model to raw surfaces. Lengths are in millimetres of the scan."
         name = self.folder.root.resolve().name
+        for fit in self.main:
+            with suppress(ShapespaceError):  # the section of the fit states the reason
+                sections.order_pictures(self.page, self.staged(fit), self.others(fit))
+        with suppress(ShapespaceError):
+            sections.order_modes(self.page, self.model())
         return self.page.html(
             f"{counted(self.total, 'fit')} in {name}",
             [Text(lead)],

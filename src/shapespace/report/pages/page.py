@@ -12,6 +12,7 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar
 
 from shapespace.errors import ShapespaceError
+from shapespace.lazy import Defer, call_later
 from shapespace.report import figures
 from shapespace.report.blocks.blocks import Block, Cell, Figure, Image, Section, Text, Turning
 from shapespace.report.blocks.wording import anchor
@@ -46,18 +47,37 @@ class Chapter:
     link: str = ""
 
 
+@dataclass(frozen=True, eq=False)
+class OrderedPicture:
+    """A drawing that another process may make while this one continues with the page.
+
+    Args:
+        draw: function that returns the drawing.
+        still: function that waits for the encoded drawing, and raises the errors of `draw`.
+    """
+
+    draw: Callable[[], Drawing]
+    still: Callable[[], Still]
+
+
+def _drawn_still(draw: Callable[[], Drawing], *, lossless: bool) -> Still:
+    return figures.encode_webp(draw(), lossless=lossless)
+
+
 class Page:
     """Builder of a page: embedded data, the number of bytes so far, and the reasons of sections that failed.
 
     Args:
         on_step: called after each picture.
+        defer: function that starts the drawing of ordered pictures.
     """
 
     planned: int = 1
     """Expected number of pictures."""
 
-    def __init__(self, on_step: Step | None = None) -> None:
+    def __init__(self, on_step: Step | None = None, defer: Defer = call_later) -> None:
         self._on_step = on_step
+        self._defer = defer
         self._payloads: list[str] = []
         self._anchors: set[str] = set()
         self._loaded: dict[object, Any] = {}
@@ -121,14 +141,25 @@ class Page:
         """Return a context in which surfaces are drawn in the views of an analysis."""
         return figures.oriented(orientation)
 
-    def figure(self, figure: Drawing, caption: str, *, alt: str, chart: bool = False) -> Figure:
+    def order(self, draw: Callable[[], Drawing], *, chart: bool) -> OrderedPicture:
+        """Return a drawing for `figure` that is made in another process, if there is one.
+
+        Args:
+            draw: function that returns the drawing; other processes must be able to load it.
+            chart: whether it is a chart, which is encoded without loss.
+        """
+        return OrderedPicture(draw, self._defer(_drawn_still, draw, lossless=chart))
+
+    def figure(self, figure: Drawing | OrderedPicture, caption: str, *, alt: str, chart: bool = False) -> Figure:
         """Return a drawing with its caption; `alt` describes the drawing."""
         still = self.still(figure, alt, lossless=chart)
         self.step(caption)
         return Figure(still, caption, "chart" if chart else "drawing")
 
-    def still(self, figure: Drawing, alt: str, *, lossless: bool = False) -> Image:
+    def still(self, figure: Drawing | OrderedPicture, alt: str, *, lossless: bool = False) -> Image:
         """Return a drawing as an image of this page, such as the still picture of a widget."""
+        if isinstance(figure, OrderedPicture):
+            return self.image(figure.still(), alt)
         return self.image(figures.encode_webp(figure, lossless=lossless), alt)
 
     def image(self, still: Still, alt: str) -> Image:

@@ -17,6 +17,7 @@ from shapespace.cohort.orientation import find_orientation
 from shapespace.cohort.table import Table, read_table
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.io.files import make_folder, write_text
+from shapespace.lazy import Defer, call_later
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report import figures
 from shapespace.report.blocks import sections
@@ -26,7 +27,7 @@ from shapespace.report.inputs.saved_fits import Folder, find_fits
 from shapespace.report.pages.correspondence_page import CorrespondencePage
 from shapespace.report.pages.demo_page import DemoPage
 from shapespace.report.pages.folder_page import MOST_ROWS, FolderPage, ManyPage, is_many
-from shapespace.report.pages.page import LARGEST_REPORT_BYTES, Chapter, Make, Page, Step
+from shapespace.report.pages.page import LARGEST_REPORT_BYTES, Chapter, Make, OrderedPicture, Page, Step
 from shapespace.report.pages.study_page import ANALYSIS, standalone_file, study_page
 from shapespace.schemas import Analysis, CorrespondenceRecord, Orientation, Quality
 from shapespace.store.results import Results
@@ -75,6 +76,7 @@ def write_report(
     model: Path | None = None,
     labels: Path | None = None,
     on_step: Step | None = None,
+    defer: Defer = call_later,
 ) -> Path:
     """Write one HTML file on the results saved in `folder`, and return its path.
 
@@ -90,6 +92,8 @@ def write_report(
         model: file of the model of the fits; None for the path in their records. Not for a demo or a study.
         labels: table of labels of the scans; None looks for labels.csv in `folder`, then next to the scans.
         on_step: called after each picture.
+        defer: function that starts the drawing of pictures of fits, perhaps in other processes, and returns a function
+            that waits for the result; default: they are drawn in this process when they are needed.
 
     Raises:
         FileError: the folder, demo.json, `model` or `labels` cannot be read, or the report cannot be written.
@@ -100,7 +104,7 @@ def write_report(
     """
     require_report_extra()
     path = Path(output) if output is not None else Path(folder) / "report.html"
-    write_text(path, _html(Folder(Path(folder)), model, labels, Page(on_step)))
+    write_text(path, _html(Folder(Path(folder)), model, labels, Page(on_step, defer)))
     return path
 
 
@@ -334,15 +338,17 @@ class _FigureFiles(Page):
         self.notes.append(f"The figure {self.headings[-1]!r} could not be drawn: {error}")
         return super().failed(error)
 
-    def still(self, figure: Drawing, alt: str, *, lossless: bool = False) -> Image:
+    def still(self, figure: Drawing | OrderedPicture, alt: str, *, lossless: bool = False) -> Image:
         """Record a drawing."""
+        figure = figure.draw() if isinstance(figure, OrderedPicture) else figure
         self.drawn.append((self.headings[0], self.headings[-1], figure))
         return Image(b"", (1, 1), alt)
 
-    def figure(self, figure: Drawing, caption: str, *, alt: str, chart: bool = False) -> Figure:
+    def figure(self, figure: Drawing | OrderedPicture, caption: str, *, alt: str, chart: bool = False) -> Figure:
         """Record a drawing with its caption."""
-        self.captions[figure] = caption
-        return super().figure(figure, caption, alt=alt, chart=chart)
+        drawing = figure.draw() if isinstance(figure, OrderedPicture) else figure
+        self.captions[drawing] = caption
+        return super().figure(drawing, caption, alt=alt, chart=chart)
 
     def turning(
         self, widget: Any, payload: bytes, poster: Image, caption: str, *, label: str, still: str

@@ -12,7 +12,6 @@ from typing import Any, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import gaussian_filter
 from scipy.spatial import cKDTree
 
 from shapespace.compiled import compiled
@@ -87,8 +86,8 @@ class Camera:
         if not len(points) or not np.isfinite(points).all():
             raise InputError("A camera needs at least one point to look at, and all of them finite.")
         axes = _view_axes(yaw_deg, pitch_deg)
-        projected = points @ axes.T
-        low, high = projected.min(axis=0), projected.max(axis=0)
+        projected = axes @ points.T
+        low, high = projected.min(axis=1), projected.max(axis=1)
         extent = high - low
         height = float(max(extent[1], extent[0] / aspect, 1e-6)) * (1 + 2 * margin)
         centre = ((low + high) / 2) @ axes
@@ -96,10 +95,9 @@ class Camera:
             return Camera(centre, height, yaw_deg, pitch_deg)
         distance = 5.0 * height + float(extent[2])
         # Nearer parts grow in perspective, so the height is that of the point which reaches farthest out.
-        offset = np.abs(projected - (low + high) / 2) * (
-            distance / (distance - (projected[:, 2:] - (low + high)[2] / 2))
-        )
-        half_height = max(float(offset[:, 1].max()), float(offset[:, 0].max()) / aspect, 1e-6)
+        x, y, z = projected - ((low + high) / 2)[:, None]
+        growth = distance / (distance - z)
+        half_height = max(float((np.abs(y) * growth).max()), float((np.abs(x) * growth).max()) / aspect, 1e-6)
         grown = 2 * half_height * (1 + 2 * margin)
         return Camera(centre, grown, yaw_deg, pitch_deg, distance)
 
@@ -306,6 +304,10 @@ def _rasterise(
     return triangle, nearest
 
 
+_vertex_normals = cached_with_owner()(vertex_normals)
+"""Vertex normals, computed once for all views of a mesh."""
+
+
 def _surfels(layer: Layer, camera: Camera, size: tuple[int, int], supersample: int) -> _Surfels:
     if layer.mesh.faces is None:
         return _balls(layer, camera, size, supersample)
@@ -318,7 +320,7 @@ def _surfels(layer: Layer, camera: Camera, size: tuple[int, int], supersample: i
     scalars = read_only(np.zeros(0)) if layer.scalars is None else layer.scalars
     scalar = np.empty(len(pixel) if len(scalars) else 0, dtype=np.float32)
     nearness = np.ones(len(vertices)) if camera.distance_mm is None else -depth
-    normals = vertex_normals(layer.mesh) @ _view_axes(camera.yaw_deg, camera.pitch_deg).T
+    normals = _vertex_normals(layer.mesh) @ _view_axes(camera.yaw_deg, camera.pitch_deg).T
     interpolate(
         pixel, triangle[pixel], screen, nearness, faces, normals, scalars, layer.categories, size[0],
         normal, scalar, is_back,
@@ -456,21 +458,60 @@ def _occlusion(
 ) -> _Single:
     """Return (n,) in (0, 1]: darker where a point lies behind its neighbours' mean depth (Luft et al. 2006)."""
     width, height = size
-    is_surface = np.zeros((height, width), dtype=np.float32)
-    is_surface.ravel()[pixel] = 1
-    depth = np.zeros((height, width), dtype=np.float32)
+    depth = np.full((height, width), np.nan, dtype=np.float32)
     depth.ravel()[pixel] = depth_mm
-    coarse = (slice(None, None, supersample), slice(None, None, supersample))
+    depth = depth[::supersample, ::supersample]
+    is_surface = np.isfinite(depth)
+    both = (is_surface.astype(np.float32), np.where(is_surface, depth, np.float32(0)))
     out = np.ones(len(pixel), dtype=np.float32)
-    row, column = pixel // width // supersample, pixel % width // supersample
     # The wide one shades the eye sockets and below the chin, the narrow one draws lips, lids and folds.
     for radius_share, max_depth, strength in ((0.026, 0.035, 26.0), (0.007, 0.010, 42.0)):
         sigma = radius_share * height / supersample
-        total = gaussian_filter(is_surface[coarse], sigma, truncate=2.5)
-        mean = gaussian_filter(depth[coarse], sigma, truncate=2.5) / np.maximum(total, 1e-6)
-        depth_behind = np.clip(depth_mm - mean[row, column], 0, max_depth * camera.height_mm)
+        weights = np.exp(-0.5 / sigma**2 * np.arange(int(2.5 * sigma + 0.5) + 1) ** 2)
+        weights /= weights[0] + 2 * weights[1:].sum()
+        total, mean = (blur(values, weights) for values in both)
+        mean /= np.maximum(total, np.float32(1e-6))
+        around = mean.repeat(supersample, axis=0).repeat(supersample, axis=1).ravel()[pixel]
+        depth_behind = np.clip(depth_mm - around, 0, max_depth * camera.height_mm)
         out *= np.exp(np.float32(-strength / camera.height_mm) * depth_behind)
     return out
+
+
+def blur(image: _Single, weights: FloatArray) -> _Single:
+    """Return an image blurred by a symmetric separable filter; beyond its edges it is mirrored.
+
+    Args:
+        image: (height, width).
+        weights: (n,) weights at 0, 1, ... n - 1 pixels.
+    """
+    reach = len(weights) - 1
+    for _ in range(2):
+        blurred = np.empty_like(image)
+        blur_columns(np.pad(image, ((reach, reach), (0, 0)), mode="symmetric"), weights, blurred)
+        image = np.ascontiguousarray(blurred.T)
+    return image
+
+
+@compiled
+def blur_columns(image: npt.NDArray[np.float32], weights: FloatArray, out: npt.NDArray[np.float32]) -> None:
+    """Blur the columns of an image.
+
+    The inner loop runs along a row, so that it is vectorised, unlike that of `scipy.ndimage`; the result is equal.
+
+    Args:
+        image: (height + 2 (n - 1), width), with n - 1 rows beyond each edge.
+        weights: (n,) weights at 0, 1, ... n - 1 pixels.
+        out: (height, width), written.
+    """
+    reach = len(weights) - 1
+    total = np.empty(out.shape[1])
+    for row in range(out.shape[0]):
+        total[:] = weights[0] * image[row + reach]
+        for k in range(reach, 0, -1):
+            above, below, weight = image[row + reach - k], image[row + reach + k], weights[k]
+            for column in range(len(total)):
+                total[column] += (np.float64(above[column]) + np.float64(below[column])) * weight
+        out[row] = total
 
 
 _TINY = 1e-9  # pixels; keeps triangles that share an edge without gaps

@@ -122,7 +122,7 @@ def colour_bar(colours: Sequence[Sequence[float]] | np.ndarray = DIVERGING) -> S
     return encoded(np.repeat(np.rint(255 * np.asarray(colours)).astype(np.uint8)[None], 10, axis=0), lossless=True)
 
 
-def encoded(image: Image, *, lossless: bool = False, quality: int = 84, effort: int = 3) -> Still:
+def encoded(image: Image, *, lossless: bool = False, quality: int = 84, effort: int = 2) -> Still:
     """Return pixels (H, W, 3) uint8 as WebP."""
     from PIL import Image as PillowImage  # of the extra `report`
 
