@@ -201,3 +201,61 @@ def boxes_of(points: FloatArray, label: IntArray, count: int) -> tuple[FloatArra
             low[label[i], k] = min(low[label[i], k], points[i, k])
             high[label[i], k] = max(high[label[i], k], points[i, k])
     return low, high
+
+
+_LEAST_AREA = 1e-6
+"""Twice the area of a triangle over its longest edge squared, below which none is made: it would count as a line."""
+_SHORT_EDGES = 1e-3
+"""Weight of squared edge lengths: it decides between triangulations of equal area, as of a flat hole."""
+
+
+@compiled
+def triangulate_border(points: FloatArray, joined: BoolArray) -> IntArray:
+    """Return triangles (N - 2, 3) between the `points` (N, 3) of a closed border, of the smallest area; (0, 3) if none.
+
+    Args:
+        points: (N, 3) vertices of the border, in the direction of its triangles, to which the new ones are opposite.
+        joined: (N, N) whether two vertices already have a common edge, which no other triangle may use.
+    """
+    n = len(points)
+    cost = np.full((n, n), np.inf)
+    middle = np.zeros((n, n), dtype=np.int32)
+    for i in range(n - 1):
+        cost[i, i + 1] = 0.0
+    for gap in range(2, n):
+        for i in range(n - gap):
+            j = i + gap
+            if joined[i, j] and gap < n - 1:
+                continue
+            ax, ay, az = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1], points[j, 2] - points[i, 2]
+            long = ax * ax + ay * ay + az * az
+            for k in range(i + 1, j):
+                rest = cost[i, k] + cost[k, j]
+                if rest >= cost[i, j]:
+                    continue
+                bx, by, bz = points[k, 0] - points[i, 0], points[k, 1] - points[i, 1], points[k, 2] - points[i, 2]
+                x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+                double = np.sqrt(x * x + y * y + z * z)
+                near = bx * bx + by * by + bz * bz
+                far = (bx - ax) ** 2 + (by - ay) ** 2 + (bz - az) ** 2
+                total = rest + 0.5 * double + _SHORT_EDGES * (long + near + far)
+                if double > _LEAST_AREA * max(long, near, far) and total < cost[i, j]:
+                    cost[i, j], middle[i, j] = total, k
+    triangles = np.empty((n - 2 if n > 2 and np.isfinite(cost[0, n - 1]) else 0, 3), dtype=np.int32)
+    if not len(triangles):
+        return triangles
+    open_spans = np.empty((n, 2), dtype=np.int32)
+    open_spans[0, 0], open_spans[0, 1] = 0, n - 1
+    waiting, made = 1, 0
+    while waiting:
+        waiting -= 1
+        i, j = open_spans[waiting, 0], open_spans[waiting, 1]
+        if j - i < 2:
+            continue
+        k = middle[i, j]
+        triangles[made, 0], triangles[made, 1], triangles[made, 2] = j, k, i
+        made += 1
+        open_spans[waiting, 0], open_spans[waiting, 1] = i, k
+        open_spans[waiting + 1, 0], open_spans[waiting + 1, 1] = k, j
+        waiting += 2
+    return triangles
