@@ -49,21 +49,22 @@ def test_the_largest_piece_has_the_largest_area_not_the_most_triangles() -> None
 
 
 @settings(max_examples=40, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.sampled_from(["sphere", "box", "plane"]))
+@given(st.integers(0, 2**32 - 1), st.sampled_from(["sphere", "outside", "box", "plane"]))
 def test_a_crop_keeps_exactly_the_triangles_inside(seed: int, kind: str) -> None:
     rng = np.random.default_rng(seed)
     mesh = together(ball(), ball(0.7, 2.5))
     centre = mesh.vertices[rng.integers(len(mesh.vertices))]
     numbers = {
-        "sphere": [*centre, rng.uniform(0.5, 2.0)], "box": [*(centre - 0.7), *(centre + rng.uniform(0.5, 2.0, 3))],
+        "sphere": [*centre, rng.uniform(0.5, 2.0)],
+        "outside": [*centre, rng.uniform(0.1, 5.0)], "box": [*(centre - 0.7), *(centre + rng.uniform(0.5, 2.0, 3))],
         "plane": [*(0.5 * centre), *rng.normal(size=3)],
     }[kind]  # fmt: skip
     crop = Crop(kind, tuple(map(float, numbers)))
     n = np.array(numbers)
 
     def is_inside(p: FloatArray) -> bool:
-        if kind == "sphere":
-            return float(np.sqrt(((p - n[:3]) ** 2).sum())) <= n[3]
+        if kind in ("sphere", "outside"):
+            return (float(np.sqrt(((p - n[:3]) ** 2).sum())) <= n[3]) == (kind == "sphere")
         if kind == "box":
             return all(n[k] <= p[k] <= n[k + 3] for k in range(3))
         return sum((p[k] - n[k]) * n[k + 3] for k in range(3)) >= 0

@@ -152,9 +152,10 @@ class FitConfig:
             the initialisation alone.
         dense: also deform the fitted surface further onto the scan, as the stage `dense` (robust method only).
         dense_settings: settings of the dense stage.
-        crop: fit only the part of the scan inside `sphere:X,Y,Z,RADIUS` or `box:X,Y,Z,X,Y,Z`, or on the side of
-            `plane:X,Y,Z,NX,NY,NZ` to which the normal points (in its frame and unit),
-            or `landmarks:MM`, within this distance in mm of the landmarks; empty for the complete scan.
+        crop: fit only the part of the scan inside `sphere:X,Y,Z,RADIUS` or `box:X,Y,Z,X,Y,Z`, outside a sphere
+            (`outside:X,Y,Z,RADIUS`), or on the side of `plane:X,Y,Z,NX,NY,NZ` to which the normal N points (in its
+            frame and unit), or `landmarks:MM`, within this distance in mm of the landmarks; empty for the complete
+            scan.
         region: part of the model to which fit, distances and verdict are restricted: a name of `ShapeModel.regions`, or
             indices of vertices; None for the complete model.
         strict: reject scans with coordinates that are NaN or infinite (default: remove the triangles that use them,

@@ -13,7 +13,7 @@ from shapespace.geometry.doctor import Finding
 from shapespace.geometry.normals import boundary_edges, face_areas, faces_of, part_of, with_triangles
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
 
-CROPS = {"sphere": 4, "box": 6, "plane": 6, "landmarks": 1}
+CROPS = {"sphere": 4, "outside": 4, "box": 6, "plane": 6, "landmarks": 1}
 """Number of values that each kind of crop needs."""
 MOST_EDGES = 1000
 """Largest number of border edges of a hole that is filled: the time grows with its cube, and is 1 s for 1000."""
@@ -21,7 +21,7 @@ MOST_EDGES = 1000
 
 @dataclass(frozen=True)
 class Crop:
-    """A crop of a scan: a sphere, a box, one side of a plane, or the surroundings of its landmarks.
+    """A crop of a scan: the inside or outside of a sphere, a box, a side of a plane, or surroundings of landmarks.
 
     Args:
         kind: a name of `CROPS`.
@@ -40,7 +40,7 @@ class Crop:
         finite = all(np.isfinite(number) for number in self.numbers)
         if CROPS.get(self.kind) != len(self.numbers) or not finite:
             raise _crop_error(self.text)
-        if self.kind in ("sphere", "landmarks") and self.numbers[-1] <= 0:
+        if self.kind in ("sphere", "outside", "landmarks") and self.numbers[-1] <= 0:
             raise InputError(f"The crop {self.text!r} needs a radius above zero.")
         if self.kind == "plane" and not any(self.numbers[3:]):
             raise InputError(f"The crop {self.text!r} needs a normal that is not zero.")
@@ -66,14 +66,14 @@ class Crop:
             raise _crop_error(text) from error
 
     def contains(self, points: FloatArray) -> BoolArray:
-        """Return the mask (N,) of the `points` (N, 3) inside a sphere or a box, or on the kept side of a plane."""
+        """Return the mask (N,) of the `points` (N, 3) that a crop without landmarks keeps."""
         if self.kind == "box":
             corners = np.reshape(self.numbers, (2, 3))
             return np.asarray(((points >= corners.min(axis=0)) & (points <= corners.max(axis=0))).all(axis=1))
         offset = points - np.array(self.numbers[:3])
         if self.kind == "plane":
             return np.asarray(offset @ np.array(self.numbers[3:]) >= 0)
-        return np.asarray(np.linalg.norm(offset, axis=1) <= self.numbers[3])
+        return np.asarray((np.linalg.norm(offset, axis=1) <= self.numbers[3]) == (self.kind == "sphere"))
 
     def cut(self, scan: Mesh, inside: BoolArray, least: int) -> tuple[Mesh, str]:
         """Return the vertices `inside` (V,) of `scan` with the triangles between them, and a sentence on them.
@@ -92,7 +92,8 @@ class Crop:
 
 def _crop_error(text: str) -> InputError:
     return InputError(
-        f"There is no crop {text!r}; give sphere:X,Y,Z,R or box:X,Y,Z,X,Y,Z or plane:X,Y,Z,NX,NY,NZ or landmarks:MM."
+        f"There is no crop {text!r}; give sphere:X,Y,Z,R or outside:X,Y,Z,R or box:X,Y,Z,X,Y,Z or "
+        "plane:X,Y,Z,NX,NY,NZ or landmarks:MM."
     )
 
 
@@ -101,8 +102,9 @@ class Grooming:
     """What is removed from scans and added to them, in the order of these fields; coordinates stay as they are.
 
     Args:
-        crop: write only the part inside `sphere:X,Y,Z,RADIUS` or `box:X,Y,Z,X,Y,Z`, or on the side of
-            `plane:X,Y,Z,NX,NY,NZ` to which the normal N points, in the frame and unit of the file; can be repeated.
+        crop: write only the part inside `sphere:X,Y,Z,RADIUS` or `box:X,Y,Z,X,Y,Z`, outside a sphere
+            (`outside:X,Y,Z,RADIUS`), or on the side of `plane:X,Y,Z,NX,NY,NZ` to which the normal N points, in the
+            frame and unit of the file; can be repeated.
         outer: remove inner surfaces, such as marrow cavities: triangles that are hardly visible from outside.
         largest: write only the connected piece with the largest area.
         fill_holes: fill holes of at most this number of border edges with triangles between their vertices

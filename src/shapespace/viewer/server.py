@@ -361,7 +361,8 @@ _VIEWER_SCRIPTS = (
     *(f"viewer-{part}.js" for part in ("stage", "model", "compare", "fits", "scan", "uploads", "landmarks")),
 )  # fmt: skip
 _STUDIO_SCRIPTS = ("studio.js", *(f"studio-{part}.js" for part in (
-    "texts", "store", "widgets", "start", "table", "scan", "specimens", "jobs", "steps", "questions", "results",
+    "texts", "store", "widgets", "start", "table", "volumes", "groom", "scan", "specimens", "jobs", "steps",
+    "questions", "results",
 )))  # fmt: skip
 ASSETS: Mapping[str, tuple[Path, str]] = {
     "viewer.css": (PAGES / "viewer.css", "text/css"),

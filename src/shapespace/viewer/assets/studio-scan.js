@@ -64,6 +64,7 @@
         <div class="row" role="group" aria-label=${S.scan.sides}>${Object.keys(SIDES).map((side) => html`<${Button} small testid=${`scan-${side}`} onclick=${() => turn(side)}>${S.scan[side]}<//>`)}
           <span class="grow"></span><${Button} small testid="scan-close" onclick=${onclose}>${window.ShapespaceTexts.close}<//></div>
         <div class="scan-view"><div ref=${box} class="canvas" data-testid="scan-view" data-ready=${state === ""}></div><p class="hint" role="status">${state}</p><span ref=${bar} class="scale-bar" data-testid="scan-scale"></span></div>
+        <${Studio.Groom} specimen=${specimen} view=${view} ready=${state === ""} />
         <p class="hint">${S.scan.axes}${borders ? ` ${S.scan.borders}` : ""}</p>
         <${Studio.Findings} specimen=${specimen} />
       <//>`;

@@ -20,7 +20,7 @@
     const [open, setOpen] = useState(false);
     if (specimen.state === "waiting") return null;
     return html`<${Button} small class="quiet show-scan" aria-label=${S.scan.show(specimen.id)} testid=${`show-${specimen.id}`} onclick=${() => setOpen(true)}>${S.scan.open}<//>
-      ${open && html`<${Studio.Scan} specimen=${specimen} onclose=${() => setOpen(false)} />`}`;
+      ${open && html`<${Studio.Scan} key=${specimen.file} specimen=${specimen} onclose=${() => setOpen(false)} />`}`;
   };
 
   /** A select of units; the first one leaves scans as they are. */
@@ -56,7 +56,7 @@
             : html`<span>${S.states[specimen.state]}</span>`}
         </button>
         <div class="row"><${Studio.Include} specimen=${specimen} /><strong title=${specimen.id}>${specimen.id}</strong><${Studio.ShowScan} specimen=${specimen} />${specimen.set === "new" && html`<span class="tag">${S.new}</span>`}
-          ${specimen.mirrored && html`<span class="tag">${S.mirrored}</span>`}${specimen.unit && html`<span class="tag">${S.unit(specimen.unit)}</span>`}</div>
+          ${specimen.mirrored && html`<span class="tag">${S.mirrored}</span>`}${specimen.groomed && html`<span class="tag">${S.groom.done}</span>`}${specimen.unit && html`<span class="tag">${S.unit(specimen.unit)}</span>`}</div>
         ${groups !== "[]" && html`<div class="row">${JSON.parse(groups).map(([column, name, colour]) => html`<span class="tag group" title=${`${column}: ${name}`}>${colour && html`<i style=${{ background: colour }}></i>`}${name}</span>`)}</div>`}
         <${Studio.Findings} specimen=${specimen} />
       </li>`, [specimen, groups, selected, onselect]);
@@ -135,6 +135,7 @@
   Studio.SelectionBar = function SelectionBar({ selected, onclear }) {
     const [removing, setRemoving] = useState(false);
     const [grouping, setGrouping] = useState(false);
+    const [grooming, setGrooming] = useState(false);
     if (Studio.state.read_only) return null;
     const ids = selected.map((one) => one.id);
     const toNew = selected.some((one) => one.set === "training"), mirrored = selected.some((one) => !one.mirrored);
@@ -147,11 +148,13 @@
         <${Button} small testid="set-selected" onclick=${() => Studio.edit({ what: "set", ids, set: toNew ? "new" : "training" })}>${toNew ? S.toNew : S.toTraining}<//>
         <${Button} small testid="group-selected" disabled=${grouping} onclick=${() => setGrouping(true)}>${S.group}<//>
         <${Button} small testid="mirror-selected" onclick=${() => Studio.edit({ what: "mirror", ids, mirrored })}>${mirrored ? S.mirror : S.unmirror}<//>
+        <${Button} small testid="groom-selected" disabled=${grooming} onclick=${() => setGrooming(true)}>${S.groom.open}<//>
         <label>${S.columns.unit} <${Studio.Unit} aria-label=${S.setUnit} data-testid="unit-selected" value=${selected.every((one) => one.unit === selected[0].unit) ? selected[0].unit : ""}
           onunit=${(select) => Studio.edit({ what: "unit", ids, unit: select.value })} /></label>
         <${Button} small testid="remove-selected" onclick=${() => setRemoving(true)}>${S.remove}<//>
         <${Button} small testid="clear-selection" onclick=${onclear}>${S.clear}<//>
         ${/* Last, on a line of its own: where it stood between the buttons, a click that met its closing went to another of them. */ grouping && html`<${Group} ids=${ids} onclose=${() => setGrouping(false)} />`}
+        ${grooming && html`<${Studio.GroomForm} specimens=${selected} onclose=${() => setGrooming(false)} />`}
         ${removing && html`<${Confirm} title=${S.removeTitle(ids.length)} text=${S.removeText} action=${S.remove} onclose=${() => setRemoving(false)}
           onyes=${async () => { if (await Studio.edit({ what: "remove", ids })) onclear(); }} />`}
       </div>`;

@@ -12,6 +12,7 @@
   const Studio = (window.ShapespaceStudio = {
     state: null, // of /api/project
     forms: {}, // of /api/forms
+    volumes: [], // uploaded label volumes whose labels are not chosen yet: {file, name, set}
     uploads: { total: 0, done: 0, added: 0, notes: [] },
     changed: () => {}, // draws the page
   });
@@ -168,7 +169,8 @@
     if (!uploading()) Studio.uploads = { total: 0, done: 0, added: 0, notes: [] };
     files.sort((a, b) => byName(a.name, b.name));
     const tables = files.filter((file) => ending(file.name, TABLES));
-    for (const file of files.filter((one) => !tables.includes(one)).concat(tables)) waiting.push([file, set, tables.includes(file)]);
+    const taker = (file) => (tables.includes(file) ? importTable : ending(file.name, Studio.state.volume_formats) ? uploadVolume : uploadScan);
+    for (const file of files.filter((one) => !tables.includes(one)).concat(tables)) waiting.push([file, set, taker(file)]);
     Studio.uploads.total += files.length;
     Studio.changed();
     for (let k = workers; k < UPLOADS_AT_ONCE && waiting.length; k++) work();
@@ -176,11 +178,10 @@
 
   async function work() {
     workers += 1;
-    while (waiting.length && !(waiting[0][2] && workers > 1)) {
-      const [file, set, isTable] = waiting.shift();
+    while (waiting.length && !(waiting[0][2] === importTable && workers > 1)) {
+      const [file, set, take] = waiting.shift();
       try {
-        if (isTable) await importTable(file);
-        else await uploadScan(file, set);
+        await take(file, set);
       } catch (error) {
         Studio.uploads.notes.push(error.message.includes(file.name) ? error.message : `${file.name}: ${error.message}`);
       }
@@ -193,10 +194,21 @@
     Studio.changed();
   }
 
-  async function uploadScan(file, set) {
-    const { formats, upload_bytes: most } = Studio.state;
-    if (!ending(file.name, formats)) throw new Error(T.uploads.format(file.name));
+  function checkSize(file) {
+    const most = Studio.state.upload_bytes;
     if (file.size > most) throw new Error(T.uploads.tooLarge(file.name, Math.round(most / 2 ** 20)));
+  }
+
+  /** Add a label volume; its labels are asked for when all files of the drop are there. */
+  async function uploadVolume(file, set) {
+    checkSize(file);
+    const { file: stored } = await json(`/api/volumes?name=${encodeURIComponent(file.name)}`, { method: "PUT", body: file });
+    Studio.volumes.push({ file: stored, name: file.name, set });
+  }
+
+  async function uploadScan(file, set) {
+    if (!ending(file.name, Studio.state.formats)) throw new Error(T.uploads.format(file.name));
+    checkSize(file);
     const answer = await json(`/api/specimens?name=${encodeURIComponent(file.name)}&set=${set}`, { method: "PUT", body: file });
     if (answer.same_as) Studio.uploads.notes.push(T.uploads.same(file.name, answer.same_as));
     else Studio.uploads.added += 1;

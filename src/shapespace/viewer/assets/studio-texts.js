@@ -31,7 +31,7 @@
     },
 
     specimens: {
-      dropTitle: "Drop scans or folders here", dropHint: (formats) => `Mesh and point cloud files (${formats}), and a table (CSV or XLSX) with their data.`,
+      dropTitle: "Drop scans or folders here", dropHint: (formats) => `Mesh and point cloud files (${formats}), label volumes (NIfTI, NRRD), and a table (CSV or XLSX) with their data.`,
       chooseFiles: "Choose files", chooseFolder: "Choose a folder", addHere: "Add from this machine", importTable: "Import a table",
       addTitle: "Add scans from this machine", byReference: "Refer to the files where they are", byCopy: "Copy the files into the project",
       addFolder: "Add this folder", added: (number) => `${count(number, "scan")} added.`,
@@ -53,6 +53,19 @@
         show: (id) => `Show ${id} in 3-D`, open: "3-D", label: (id) => `The scan ${id} in 3-D`, reading: "Reading the scan", failed: "The 3-D view cannot be loaded; reload the page.", sides: "Sides",
         front: "Front", back: "Back", left: "Left", right: "Right", top: "Top", bottom: "Bottom", units: "units of the file",
         axes: "The axes are those of the file: front looks along -z, with y up. Drag to turn, scroll to zoom.", borders: "Red: borders of holes.",
+      },
+      groom: {
+        open: "Groom", done: "groomed", title: "Groom", largest: "Keep the largest piece", outer: "Remove inner surfaces", holes: "Fill holes with border edges up to",
+        hint: "The part that remains keeps its coordinates and its unit. The file of the scan stays as it is.", apply: "Groom", original: "Use the original scan", running: "Being groomed",
+        sphere: "Crop by a sphere", plane: "Crop by a plane", radius: "Radius", keep: "Keep", sides: { inside: "the part inside", outside: "the part outside", behind: "the part behind it", front: "the part in front of it" },
+        click: { sphere: "Click the centre of the sphere on the scan.", plane: "Turn the scan, then click a point on it: the plane passes through this point and faces you." },
+        keeps: (percent) => `${percent} % of the points that are drawn remain.`, clear: "No crop",
+      },
+      volumes: {
+        title: (number) => `Surfaces of ${count(number, "label volume")}`, reading: (done, total) => `Reading the labels of volume ${done} of ${total}`, which: "Labels that form the object",
+        label: (name, voxels, number, total) => `${name}: ${voxels.toLocaleString("en")} voxels${number < total ? `, in ${number} of ${total} volumes` : ""}`,
+        together: "Several labels become one object.", lacks: (name) => `${name} lacks a chosen label; it becomes no specimen.`, smooth: "Smoothing, standard deviation in voxels", make: "Make surfaces",
+        specimens: (number) => `${count(number, "surface")} will be added as ${number === 1 ? "a specimen" : "specimens"}, in mm.`,
       },
       paste: {
         title: (number) => `Paste the cells of ${count(number, "specimen")}?`, action: "Paste",

@@ -25,6 +25,7 @@ from shapespace.errors import FileError, InputError
 from shapespace.io.containers.json_files import plain_json
 from shapespace.io.files import atomic_path
 from shapespace.io.meshes.mesh_io import MESH_ENDINGS, MESH_FILE_ENDINGS
+from shapespace.io.volume_io import VOLUME_ENDINGS
 from shapespace.schemas import read
 from shapespace.types import MM_PER_UNIT
 from shapespace.version import __version__
@@ -47,9 +48,11 @@ from shapespace.viewer.studio.job_commands import (
     OptionLabels,
     Outdated,
     checks,
+    groomed_scans,
     order,
     outdated_results,
     shapes_of,
+    stored_volumes,
 )
 from shapespace.viewer.studio.jobs import Job, Jobs, Order, history
 from shapespace.viewer.studio.project import (
@@ -62,9 +65,11 @@ from shapespace.viewer.studio.project import (
     recent_projects,
     with_cells,
 )
+from shapespace.viewer.studio.run_job import PARTLY
 from shapespace.viewer.studio.specimen_checks import SpecimenChecks
 from shapespace.viewer.studio.views import REPORT_PAGE, Views, result_path, view_kinds
 
+_VOLUME_ENDINGS = tuple(ending for ending in VOLUME_ENDINGS if ending != ".mhd")  # whose data are in another file
 _TABLE_BYTES, _REQUEST_BYTES = 2**24, 2**20
 _EVENT_S = 0.4  # between events
 _MOST_LISTED = 2000  # folders and files of a listing
@@ -91,7 +96,8 @@ class OpenProject:
         self._resources = ExitStack()
         if not read_only:
             self._resources.enter_context(only_writer(self.project.folder))
-        self.jobs = Jobs(self.project.folder, changed, read_only=read_only)
+        takers = {"surface": self._take_surfaces, "groom": self._take_groomed}
+        self.jobs = Jobs(self.project.folder, changed, takers, read_only=read_only)
         self.checks = SpecimenChecks(self.project.folder, changed, self.project.exclude, read_only=read_only)
         self.views = Views(self._result, upload_bytes, labels)
         self._sentence = labels.sentence
@@ -103,6 +109,12 @@ class OpenProject:
     def close(self) -> None:
         """Close the project; a running job continues."""
         self._resources.close()
+
+    def _take_surfaces(self, job: Job) -> None:
+        self.project.add_surfaces(self.project.folder / job.output, _role(job.options.get("set")))
+
+    def _take_groomed(self, job: Job) -> None:
+        self.project.take_groomed(groomed_scans(job, self.project.folder))
 
     def _result(self, number: int) -> Path | None:
         """Return the path of the result of a job; None if it has none."""
@@ -122,7 +134,8 @@ class OpenProject:
             }  # fmt: skip
             specimens.append({
                 "id": specimen.id, "file": specimen.file, "set": specimen.role, "included": specimen.included,
-                "unit": specimen.unit, "mirrored": specimen.mirrored, "cells": specimen.cells, **facts,
+                "unit": specimen.unit, "mirrored": specimen.mirrored, "groomed": bool(specimen.original),
+                "cells": specimen.cells, **facts,
                 "findings": [{**finding, "text": self._sentence(finding["text"])} for finding in facts["findings"]],
             })  # fmt: skip
         return {
@@ -141,13 +154,15 @@ class OpenProject:
         page = f"/view/{job.number}/"
         pages = [page, *(f"{page}{REPORT_PAGE}/" for _ in kinds[1:])]
         sentences, methods = ([], None) if path is None else _words(path)
+        is_partly = job.kind in ("surface", "groom") and job.code == PARTLY
+        message = (is_partly and self.jobs.problems(job)) or job.message
         return {
             "number": job.number, "kind": job.kind, "command": job.command, "status": job.status,
-            "message": self._sentence(job.message), "progress": progress, "seconds": self.jobs.running_for(job),
+            "message": self._sentence(message), "progress": progress, "seconds": self.jobs.running_for(job),
             "left_s": left_s, "output": job.output, "options": job.options, "on": job.on,
             "views": [{"kind": kind, "href": href} for kind, href in zip(kinds, pages, strict=False)],
             "sentences": list(map(self._sentence, sentences)), "methods": methods and self._sentence(methods),
-            "outdated": self._outdated[1].get(job.number),
+            "outdated": self._outdated[1].get(job.number), "partly": is_partly,
             # A command that rejected its input would reject it again.
             "can_continue": job.status in ("cancelled", "interrupted") or (job.status == "failed" and job.code != 2),
         }  # fmt: skip
@@ -207,6 +222,9 @@ class Studio:
             Route("/api/close", self._close_project, methods=["POST"]),
             Route("/api/folders", self._folders),
             Route("/api/specimens", self._upload, methods=["PUT"]),
+            Route("/api/volumes", self._upload_volume, methods=["PUT"]),
+            Route("/api/volumes", self._forget_volumes, methods=["DELETE"]),
+            Route("/api/labels", self._labels_of_volume, methods=["POST"]),
             Route("/api/import", self._take_files, methods=["POST"]),
             Route("/api/thumbnails/{id}", self._thumbnail),
             Route("/api/scans/{id}", self._scan),
@@ -270,7 +288,8 @@ class Studio:
         return json_response(
             {
                 "version": __version__, "project": None if self._open is None else self._open.facts(),
-                "recent": recent_projects(), "formats": list(MESH_ENDINGS), "upload_bytes": self._upload_bytes,
+                "recent": recent_projects(), "formats": list(MESH_ENDINGS),
+                "volume_formats": list(_VOLUME_ENDINGS), "upload_bytes": self._upload_bytes,
                 "units": list(MM_PER_UNIT), "read_only": self._read_only,
             }
         )  # fmt: skip
@@ -319,15 +338,44 @@ class Studio:
         if not name.lower().endswith(MESH_FILE_ENDINGS):
             raise HTTPException(415, f"{name} is not a scan that can be read; drop {', '.join(MESH_ENDINGS)}.")
         project = self._project.project
+        target = await self._store(request, name)
+        added, same_as = await run_in_threadpool(project.add_stored, target, role, name)
+        self._changed()
+        return json_response({"id": added, "same_as": same_as}, 201)
+
+    async def _store(self, request: Request, name: str) -> Path:
+        """Write the body of a request into a new file of the project."""
+        project = self._project.project
         limit = f"{name} is larger than the {self._upload_bytes / 2**20:g} MB that the studio takes."
         target = await run_in_threadpool(project.new_file, name)
         with project.removed_on_error(target), atomic_path(target) as path, path.open("wb") as file:
             async with aclosing(body_pieces(request, self._upload_bytes, limit)) as pieces:
                 async for piece in pieces:
                     file.write(piece)
-        added, same_as = await run_in_threadpool(project.add_stored, target, role, name)
-        self._changed()
-        return json_response({"id": added, "same_as": same_as}, 201)
+        return target
+
+    async def _upload_volume(self, request: Request) -> Response:
+        name = display_name(request.query_params.get("name", ""))
+        if not name.lower().endswith(_VOLUME_ENDINGS):
+            raise HTTPException(415, f"{name} is not a volume that can be read; drop {', '.join(_VOLUME_ENDINGS)}.")
+        target = await self._store(request, name)
+        return json_response({"file": target.relative_to(self._project.project.folder).as_posix()}, 201)
+
+    async def _labels_of_volume(self, request: Request) -> Response:
+        content = await json_body(request, _REQUEST_BYTES)
+        opened = self._project
+        [file] = stored_volumes(opened.project, [content.get("file")])
+        return json_response(await opened.checks.labels(opened.project.folder / file))
+
+    async def _forget_volumes(self, request: Request) -> Response:
+        """Remove uploaded volumes of which no surfaces were made."""
+        content = await json_body(request, _REQUEST_BYTES)
+        opened = self._project
+        used = {word for job in opened.jobs.all() for word in job.arguments}
+        for file in stored_volumes(opened.project, content.get("files")):
+            if file not in used:
+                (opened.project.folder / file).unlink(missing_ok=True)
+        return json_response({})
 
     async def _take_files(self, request: Request) -> Response:
         content = await json_body(request, _REQUEST_BYTES)

@@ -7,12 +7,15 @@ import csv
 import io
 import re
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any, Literal
+from pathlib import Path
+from typing import Any, Literal, cast
 
+from shapespace.batch.result_folder import names_for
 from shapespace.cohort.read import cohort_file_text
 from shapespace.cohort.table import Table, is_number, list_names
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.io.tables.table_io import DECIMAL_COMMA
+from shapespace.io.volume_io import VOLUME_ENDINGS
 from shapespace.schemas import CorrespondRecord
 from shapespace.statistics.compare_formula import design_of
 from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS
@@ -32,6 +35,8 @@ CORRESPONDENCES = ("correspond", "redo")
 _STUDY = (*CORRESPONDENCES, "build", "quality", "morphospace", *QUESTIONS[:-1], "fit", "complete")
 """Kinds of results in the report of the study, in the order of its chapters."""
 _INPUTS = "inputs"
+_NAMES = ("name", "files", "ids", "set")
+"""Keys of the options of a job that name scans or volumes; all others are options of its command."""
 _TERMINAL_NOTES = re.compile(
     r" \([^()]*(?:NAME\.|MODEL\.h5|about\.json)[^()]*\)|; exit with \d [^.;]*|(?m:^(?:next|usage): .*\n?)"
 )
@@ -109,7 +114,7 @@ def order(
         InputError: it cannot be run: no such kind or option, or a result or specimens are missing.
     """
     words = forms.get("correspond" if kind == "redo" else kind, {}).get("command", ())
-    given = [] if kind == "redo" else _option_arguments(forms, kind, options)
+    given = _option_arguments(forms, kind, {flag: options[flag] for flag in options if flag not in _NAMES})
     folder, stem = project.folder, f"{_INPUTS}/{number:04d}"
     state, listed = project.state, f"{stem}.csv"
     if kind == "correspond":
@@ -123,6 +128,16 @@ def order(
         if name not in {specimen.id for specimen in state.specimens}:
             raise InputError(f"There is no specimen {name[:40]!r}; choose one of the list.")
         return Order((*words, "--redo", name, "-o", before.output), before.output)
+    if kind == "surface":
+        output = f"surfaces/{number:04d}"
+        return Order((*words, *stored_volumes(project, options.get("files")), "-o", output, *given), output)
+    if kind == "groom":
+        ids = options.get("ids")
+        chosen = [specimen for specimen in state.specimens if isinstance(ids, list) and specimen.id in ids]
+        if not chosen or not given:
+            raise InputError("Select the specimens to groom, and choose a step.")
+        output = f"groomed/{number:04d}"
+        return Order((*words, *(specimen.file for specimen in chosen), "-o", output, *given, "--quiet"), output)
     if kind == "build":
         before = result_of(jobs, CORRESPONDENCES, on)
         output = f"model-{number}.h5"
@@ -165,6 +180,37 @@ def order(
     if kind not in QUESTIONS:
         raise InputError(f"There is no action {kind[:30]!r}; reload the page.")
     return _question(project, jobs, kind, words, given, options, on, number)
+
+
+def stored_volumes(project: Project, files: Any) -> Sequence[str]:
+    """Return the paths of label volumes in the project.
+
+    Raises:
+        InputError: there are none, or a path is not that of a volume in the project.
+    """
+    files = cast(list[Any], files) if isinstance(files, list) else []
+    for file in files:
+        path = project.folder / str(file)
+        if path.parent != project.folder / "scans" or not path.name.lower().endswith(VOLUME_ENDINGS):
+            raise InputError(f"There is no volume {str(file)[:40]!r}; drop it again.")
+    if not files:
+        raise InputError("There is no volume with the chosen labels; drop label volumes.")
+    return files
+
+
+def groomed_scans(job: Job, folder: Path) -> dict[str, str]:
+    """Return the path of each scan that a job groomed -> path of the groomed scan, both as in `Specimen.file`.
+
+    Args:
+        job: job that groomed scans.
+        folder: folder of the project.
+    """
+    scans = job.arguments[1 : job.arguments.index("-o")]
+    paths = {
+        scan: f"{job.output}/{name}.ply"
+        for scan, name in zip(scans, names_for([folder / scan for scan in scans]), strict=True)
+    }
+    return {scan: path for scan, path in paths.items() if (folder / path).is_file()}
 
 
 def _question(
