@@ -48,7 +48,7 @@
       const circle = (a, b) => ring((k) => add(point, [a, radius * Math.cos((2 * Math.PI * k) / ROUND)], [b, radius * Math.sin((2 * Math.PI * k) / ROUND)]));
       return [...circle([1, 0, 0], [0, 1, 0]), ...circle([0, 1, 0], [0, 0, 1]), ...circle([0, 0, 1], [1, 0, 0])];
     }
-    const [a, b, c, d] = [[1, 1], [1, -1], [-1, -1], [-1, 1]].map(([x, y]) => add(point, [right, 0.6 * x * size], [up, 0.6 * y * size]));
+    const [a, b, c, d] = [[1, 1], [1, -1], [-1, -1], [-1, 1]].map(([x, y]) => add(point, [right, 0.45 * x * size], [up, 0.45 * y * size]));
     return [a, b, b, c, c, d, d, a, point, add(point, [back, keep === "front" ? 0.3 * size : -0.3 * size])];
   }
 

@@ -47,6 +47,7 @@
   }
 
   function Card({ specimen, groups, selected, onselect }) {
+    const tags = [specimen.set === "new" && S.new, specimen.mirrored && S.mirrored, specimen.groomed && S.groom.done, specimen.unit && S.unit(specimen.unit)].filter(Boolean);
     return useMemo(() => html`
       <li class=${`card ${specimen.included ? "" : "excluded"}`} data-testid=${`card-${specimen.id}`} data-state=${specimen.state}>
         <button type="button" class="picture" aria-pressed=${selected} data-testid=${`select-${specimen.id}`} onclick=${(event) => onselect(specimen.id, event)}>
@@ -55,8 +56,8 @@
             ? html`<img class=${specimen.mirrored ? "mirrored" : ""} src=${`/api/thumbnails/${encodeURIComponent(specimen.id)}`} alt="" loading="lazy" />`
             : html`<span>${S.states[specimen.state]}</span>`}
         </button>
-        <div class="row"><${Studio.Include} specimen=${specimen} /><strong title=${specimen.id}>${specimen.id}</strong><${Studio.ShowScan} specimen=${specimen} />${specimen.set === "new" && html`<span class="tag">${S.new}</span>`}
-          ${specimen.mirrored && html`<span class="tag">${S.mirrored}</span>`}${specimen.groomed && html`<span class="tag">${S.groom.done}</span>`}${specimen.unit && html`<span class="tag">${S.unit(specimen.unit)}</span>`}</div>
+        <div class="row"><${Studio.Include} specimen=${specimen} /><strong title=${specimen.id}>${specimen.id}</strong><${Studio.ShowScan} specimen=${specimen} /></div>
+        ${tags.length > 0 && html`<div class="row">${tags.map((tag) => html`<span class="tag">${tag}</span>`)}</div>`}
         ${groups !== "[]" && html`<div class="row">${JSON.parse(groups).map(([column, name, colour]) => html`<span class="tag group" title=${`${column}: ${name}`}>${colour && html`<i style=${{ background: colour }}></i>`}${name}</span>`)}</div>`}
         <${Studio.Findings} specimen=${specimen} />
       </li>`, [specimen, groups, selected, onselect]);

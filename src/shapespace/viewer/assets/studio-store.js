@@ -204,6 +204,7 @@
     checkSize(file);
     const { file: stored } = await json(`/api/volumes?name=${encodeURIComponent(file.name)}`, { method: "PUT", body: file });
     Studio.volumes.push({ file: stored, name: file.name, set });
+    Studio.volumes.sort((a, b) => byName(a.name, b.name));
   }
 
   async function uploadScan(file, set) {

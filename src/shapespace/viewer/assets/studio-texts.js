@@ -64,7 +64,7 @@
       volumes: {
         title: (number) => `Surfaces of ${count(number, "label volume")}`, reading: (done, total) => `Reading the labels of volume ${done} of ${total}`, which: "Labels that form the object",
         label: (name, voxels, number, total) => `${name}: ${voxels.toLocaleString("en")} voxels${number < total ? `, in ${number} of ${total} volumes` : ""}`,
-        together: "Several labels become one object.", lacks: (name) => `${name} lacks a chosen label; it becomes no specimen.`, smooth: "Smoothing, standard deviation in voxels", make: "Make surfaces",
+        together: "Several labels become one object.", lacks: (name) => `${name} lacks a chosen label; it becomes no specimen.`, make: "Make surfaces",
         specimens: (number) => `${count(number, "surface")} will be added as ${number === 1 ? "a specimen" : "specimens"}, in mm.`,
       },
       paste: {

@@ -21,10 +21,10 @@
 
   /** Asks once for all volumes of a drop. */
   Studio.VolumeLabels = function VolumeLabels({ volumes }) {
-    const initial = Studio.forms.surface.options.find((option) => option.flag === "--smooth").initial;
+    const smoothing = Studio.forms.surface.options.find((option) => option.flag === "--smooth");
     const [found, setFound] = useState([]); // volumes with their labels, or with an error
     const [ticked, setTicked] = useState(null); // labels that the user chose
-    const [smooth, setSmooth] = useState(initial);
+    const [smooth, setSmooth] = useState("");
     useEffect(() => {
       let ended = false;
       const read = async () => {
@@ -52,7 +52,7 @@
     };
     const make = Viewer.guarded(async () => {
       const files = usable.map((volume) => volume.file), options = { files, set: usable[0].set, "--label": chosen.join(",") };
-      if (smooth.trim() !== initial) options["--smooth"] = smooth.trim();
+      if (smooth.trim()) options["--smooth"] = smooth.trim();
       if (await Studio.runJob("surface", options)) await close(files);
     });
     const toggle = ({ choice }) => setTicked(chosen.includes(choice) ? chosen.filter((other) => other !== choice) : [...chosen, choice]);
@@ -62,10 +62,10 @@
         ${found.filter((volume) => volume.error).map((volume) => html`<p class="problem" role="alert">${volume.error}</p>`)}
         ${labels.length > 0 && html`
           <fieldset class="choices labels"><legend>${V.which}</legend>
-            ${labels.map((label) => html`<label class="check" key=${label.choice}><input type="checkbox" data-testid=${`label-${label.choice}`} checked=${chosen.includes(label.choice)} onchange=${() => toggle(label)} />${V.label(label.name, label.voxels, label.volumes, found.length)}</label>`)}
+            ${labels.map((label) => html`<label class="check" key=${label.choice}><input type="checkbox" data-testid=${`label-${label.choice}`} checked=${chosen.includes(label.choice)} onchange=${() => toggle(label)} />${V.label(label.name, label.voxels, label.volumes, readable.length)}</label>`)}
           </fieldset>
           <p class="hint">${V.together}</p>
-          <label>${V.smooth} <input inputmode="decimal" size="5" data-testid="volumes-smooth" value=${smooth} oninput=${(event) => setSmooth(event.target.value)} /></label>
+          <label>${smoothing.label} <input inputmode="decimal" size="5" data-testid="volumes-smooth" placeholder=${T.jobs.default} value=${smooth} oninput=${(event) => setSmooth(event.target.value)} /></label> <span class="hint">${smoothing.help}</span>
           ${isRead && lacking.map((volume) => html`<p class="problem">${V.lacks(volume.name)}</p>`)}
           ${isRead && usable.length > 0 && html`<p role="status" data-testid="volumes-usable">${V.specimens(usable.length)}</p>`}`}
         <div class="row end"><${Button} testid="volumes-cancel" onclick=${Viewer.guarded(() => close([]))}>${T.cancel}<//>
