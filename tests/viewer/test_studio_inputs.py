@@ -9,6 +9,8 @@ import pytest
 from test_studio_project import tetrahedron
 from test_studio_server import ended, own_home, state, studio, until, upload
 
+from shapespace.datasets.bones import Bone
+from shapespace.datasets.organs import raw_surface
 from shapespace.errors import InputError
 from shapespace.geometry.normals import faces_of
 from shapespace.geometry.volume_surface import count_labels
@@ -202,3 +204,27 @@ def test_a_result_of_the_scan_before_it_was_groomed_is_outdated(tmp_path: Path) 
     assert project.undo_text == "groom a" and done.outdated == {1: "specimens"}
     project.undo(project.revision)
     assert not done.outdated
+
+
+def test_a_specimen_in_another_unit_is_named_before_the_correspondence_until_its_unit_is_set(tmp_path: Path) -> None:
+    with studio(tmp_path / "p") as client:
+        for k in range(6):
+            bone = raw_surface(Bone.draw(np.random.default_rng(k)), np.random.default_rng(k), 600)
+            scan = tmp_path / f"bone{k}.ply"
+            write_mesh(scan, bone.with_vertices(bone.vertices * (0.1 if k == 4 else 1.0)))
+            client.put("/api/specimens", params={"name": scan.name}, content=scan.read_bytes())
+        project = until(client, lambda now: all(one["state"] == "ready" for one in now["specimens"]))
+        (odd,) = project["odd"]
+        assert (odd["id"], odd["unit"]) == ("bone4", "cm") and "in cm it would have their size" in odd["text"]
+        checks = client.post("/api/checks", json={"kind": "correspond", "options": {}}).json()
+        assert [check["level"] for check in checks] == ["ok", "warning"] and checks[1]["text"].startswith("bone4: ")
+        client.post("/api/edit", json={
+            "what": "unit", "ids": ["bone4"], "unit": "cm", "revision": project["revision"],
+        })  # fmt: skip
+        assert state(client)["odd"] == []
+        client.post("/api/undo", json={"revision": project["revision"] + 1})
+        assert len(state(client)["odd"]) == 1
+        client.post("/api/edit", json={
+            "what": "include", "ids": ["bone4"], "included": False, "revision": project["revision"] + 2,
+        })  # fmt: skip
+        assert state(client)["odd"] == []

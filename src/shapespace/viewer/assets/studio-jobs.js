@@ -82,7 +82,7 @@
   }
 
   /** The form of a command with its checks and its button. */
-  function JobForm({ kind, sources = [], defaults, strong, checked, disabled, label, children }) {
+  function JobForm({ kind, sources = [], defaults, strong, checked = kind === "correspond", disabled, label, children }) {
     const form = Studio.forms[kind];
     const initial = useMemo(() => Object.fromEntries((form ? form.options : []).map((option) => [option.flag, option.initial === null ? "" : option.initial])), [form]);
     // The settings open as the last run had them.
@@ -127,7 +127,8 @@
         ${children}
         <button class=${strong ? "strong wide" : "wide"} data-testid=${`run-${kind}`} disabled=${disabled || starting || missing || problem}>${word}</button>
         ${/* Below the button, which they must not move while it is pressed. */ checked && html`<div class="checks" role="status" aria-label=${T.questions.checks} data-testid="checks">
-          ${checks === null ? html`<p class="hint">${T.questions.checking}</p>` : checks.map((check) => html`<p class=${check.level}><b>${T.questions.levels[check.level]}</b> ${check.text}</p>`)}</div>`}
+          ${checks === null ? html`<p class="hint">${T.questions.checking}</p>` : checks.map((check) => html`<p class=${check.level}><b>${T.questions.levels[check.level]}</b> ${check.text}</p>`)}
+          ${kind === "correspond" && Studio.state.project.odd.length > 0 && html`<a href="#specimens" data-testid="odd-link">${T.specimens.odd.link}</a>`}</div>`}
       </form>`;
   }
 

@@ -63,8 +63,17 @@
       </li>`, [specimen, groups, selected, onselect]);
   }
 
+  /** Specimens that differ from the others, each with its view and a unit in which it would not. */
+  const Odd = ({ project }) => project.odd.length > 0 && html`
+    <section class="notes" aria-label=${S.odd.title} data-testid="odd"><h3>${S.odd.title}</h3>
+      ${project.odd.map(({ id, text, unit }) => html`<p key=${id} data-testid=${`odd-${id}`}><strong>${id}</strong>: ${text}
+        ${unit && html` <${Button} edits small testid=${`odd-unit-${id}`} onclick=${() => Studio.edit({ what: "unit", ids: [id], unit })}>${S.odd.setUnit(S.unit(unit))}<//>`}
+        <${Studio.ShowScan} specimen=${project.specimens.find((one) => one.id === id)} /></p>`)}
+    </section>`;
+
   /** Notes on the table, and the number of specimens of each class. */
   const About = ({ project }) => html`
+    <${Odd} project=${project} />
     ${project.notes.length > 0 && html`<section class="notes" aria-label=${S.notes} data-testid="notes"><h3>${S.notes}</h3>${project.notes.map((note) => html`<p>${note}</p>`)}</section>`}
     ${Object.keys(project.counts).length > 0 && html`
       <section aria-label=${S.classes} class="counts" data-testid="counts">

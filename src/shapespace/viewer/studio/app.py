@@ -12,6 +12,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
 from msgspec import to_builtins
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
@@ -21,6 +22,7 @@ from starlette.routing import Mount, Route
 from starlette.types import ASGIApp
 
 from shapespace.batch.result_folder import LOCK, only_writer
+from shapespace.correspondence.odd_scans import OddScan, ScanMeasures, find_odd_scans
 from shapespace.errors import FileError, InputError
 from shapespace.io.containers.json_files import plain_json
 from shapespace.io.files import atomic_path
@@ -103,6 +105,7 @@ class OpenProject:
         self._sentence = labels.sentence
         self._forms = forms
         self._outdated: tuple[object, dict[int, Outdated]] = (None, {})
+        self._odd: tuple[object, dict[str, OddScan]] = (None, {})
         for resource in (self.views, self.checks, self.jobs):
             self._resources.callback(resource.close)
 
@@ -121,9 +124,26 @@ class OpenProject:
         job = next((job for job in self.jobs.all() if job.number == number and job.status == "done"), None)
         return None if job is None else result_path(self.project.folder, job.output)
 
+    def odd_scans(self) -> dict[str, OddScan]:
+        """Return the included specimens that differ from the others in size or shape, by their ids."""
+        names: list[str] = []
+        units: list[str] = []
+        measures: list[ScanMeasures] = []
+        for specimen in self.project.state.specimens:
+            facts = self.checks.facts(self.project.path(specimen)) if specimen.included else None
+            if facts is not None and "profile" in facts:
+                names.append(specimen.id)
+                units.append(specimen.unit or "mm")
+                measures.append(ScanMeasures(facts["size"], np.array(facts["profile"])))
+        key = (names, units, [measure.size for measure in measures])
+        if key != self._odd[0]:
+            self._odd = key, {names[k]: odd for k, odd in find_odd_scans(measures, units).items()}
+        return self._odd[1]
+
     def facts(self) -> dict[str, Any]:
         """Return the state for the page."""
-        project, state, jobs = self.project, self.project.state, self.jobs.all()
+        jobs, project = self.jobs.all(), self.project  # in this order: a job that is done has changed the state
+        state = project.state
         key = (state, [(job.number, job.status) for job in jobs])
         if key != self._outdated[0]:
             self._outdated = key, outdated_results(project, jobs, self._forms)
@@ -135,12 +155,14 @@ class OpenProject:
             specimens.append({
                 "id": specimen.id, "file": specimen.file, "set": specimen.role, "included": specimen.included,
                 "unit": specimen.unit, "mirrored": specimen.mirrored, "groomed": bool(specimen.original),
-                "cells": specimen.cells, **facts,
+                "cells": specimen.cells, **{key: fact for key, fact in facts.items() if key != "profile"},
                 "findings": [{**finding, "text": self._sentence(finding["text"])} for finding in facts["findings"]],
             })  # fmt: skip
         return {
             "name": state.name, "folder": str(project.folder), "revision": project.revision,
-            "columns": list(state.columns), "specimens": specimens, "notes": state.notes(), "counts": state.counts(),
+            "columns": list(state.columns), "specimens": specimens,
+            "odd": [{"id": name, "text": odd.text, "unit": odd.unit} for name, odd in self.odd_scans().items()],
+            "notes": state.notes(), "counts": state.counts(),
             "undo": project.undo_text, "redo": project.redo_text, "landmarks": state.landmarks,
             "landmarks_on": state.landmarks_on,
             "jobs": [self._job(job) for job in jobs],
@@ -450,7 +472,8 @@ class Studio:
             except InputError as error:
                 return json_response([{"level": "problem", "text": str(error)}])
         given = cast(dict[str, Any], options) if isinstance(options, dict) else {}
-        found = await run_in_threadpool(checks, opened.project, self._forms, kind, given, shapes)
+        odd = [f"{name}: {odd.text}" for name, odd in opened.odd_scans().items()]
+        found = await run_in_threadpool(checks, opened.project, self._forms, kind, given, shapes, odd)
         return json_response([{**finding, "text": self._labels.sentence(finding["text"])} for finding in found])
 
     def _change_job(self, change: Callable[[Jobs, int], None], request: Request) -> Response:

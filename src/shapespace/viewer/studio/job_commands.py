@@ -298,9 +298,19 @@ def _results_of_study(jobs: Sequence[Job]) -> list[Job]:
 
 
 def checks(
-    project: Project, forms: Forms, kind: str, options: Mapping[str, Any], shapes: Job | None
-) -> list[dict[str, str]]:
-    """Return findings on a question before it is run: a level (`ok`, `warning`, `problem`) and a sentence each."""
+    project: Project, forms: Forms, kind: str, options: Mapping[str, Any], shapes: Job | None,
+    odd: Sequence[str] = (),
+) -> list[dict[str, str]]:  # fmt: skip
+    """Return findings on a run before it is started: a level (`ok`, `warning`, `problem`) and a sentence each.
+
+    Args:
+        project: project with the specimens.
+        forms: forms of all kinds.
+        kind: kind of the job.
+        options: flag -> value, as sent by the page.
+        shapes: job whose shapes a question is about; None for other kinds.
+        odd: sentences on specimens that differ from the others.
+    """
     chosen = _specimens_of(project, shapes)
     columns = _used_columns(project.state.columns, options)
     missing = {column: sum(not specimen.cells.get(column) for specimen in chosen) for column in columns}
@@ -309,6 +319,8 @@ def checks(
     if drop_missing:
         chosen = [specimen for specimen in chosen if all(specimen.cells.get(column) for column in columns)]
     found = [{"level": "ok" if len(chosen) >= 2 else "problem", "text": f"Included specimens: {len(chosen)}."}]
+    if kind == "correspond":
+        return [*found, *({"level": "warning", "text": text} for text in odd)]
     if shapes is not None and shapes.kind in CORRESPONDENCES:
         there = _surface_files(project, shapes, chosen)
         lacking = [specimen.id for specimen in chosen if specimen.id not in there]

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from shapespace.batch.workers import context, end_after
+from shapespace.correspondence.odd_scans import ScanMeasures
 from shapespace.errors import FileError, InputError, ShapespaceError
 from shapespace.geometry.doctor import examine_and_repair
 from shapespace.geometry.mirror_plane import mirror_image
@@ -64,6 +65,9 @@ class SpecimenChecks:
         try:
             facts = json.loads((self._folder / f"{key}.json").read_text(encoding="utf-8"))
         except (OSError, ValueError):
+            self._ask(key, scan)
+            return None
+        if facts.get("state") == "ready" and "profile" not in facts:  # from an earlier version
             self._ask(key, scan)
             return None
         self._known[key] = facts
@@ -169,6 +173,8 @@ def check_scan(scan: Path, stem: Path) -> dict[str, Any]:
             "extent": 0.0 if repaired is None else float(report.extent.max()), "findings": findings,
         }  # fmt: skip
         if repaired is not None:
+            measures = ScanMeasures.of(repaired)
+            facts |= {"size": measures.size, "profile": measures.profile.tolist()}
             picture, _ = mesh_still(repaired)
             write_bytes(stem.with_suffix(".webp"), picture)
     except ShapespaceError as error:
