@@ -13,16 +13,11 @@ from shapespace.geometry.grooming import Crop
 from shapespace.geometry.normals import faces_of
 from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.types import Mesh
+from shapespace.viewer.studio.project import Project, with_cells
 
 
 def specimens(project: Path) -> dict[str, dict]:
     return {one["id"]: one for one in json.loads((project / "project.json").read_text())["specimens"]}
-
-
-def wait_for(tab, user: User, number: int, status: str = "done") -> None:
-    tab.page.get_by_test_id("tab-history").click()
-    tab.page.get_by_test_id(f"history-{number}").locator(f".{status}, [data-status={status}]").first.wait_for()
-    tab.page.get_by_test_id("tab-specimens").click()
 
 
 def write_masks(folder: Path) -> list[Path]:
@@ -148,3 +143,39 @@ def test_scans_are_groomed_by_clicks_and_the_originals_come_back(open_tab, tmp_p
         groomed.wait_for(state="detached")
         assert specimens(project)["bone_1"]["file"] == "scans/bone_1.ply"
     assert tab.complaints == [] and tab.asked == []
+
+
+def test_odd_specimens_are_named_before_the_run_and_rows_of_the_table_are_one_line_high(
+    open_tab, tmp_path: Path
+) -> None:
+    project = Project.open(tmp_path / "bones", create=True)
+    for k in range(24):
+        rng = np.random.default_rng(k)
+        bone = raw_surface(Bone.draw(rng), rng, 300)
+        path = project.new_file(f"museum_of_natural_history_specimen_{k:03}.ply")
+        faces = np.concatenate([faces_of(bone), faces_of(bone)[: k % 3]])  # repaired: some triangles repeat others
+        write_mesh(path, Mesh(bone.vertices * (0.1 if k == 5 else 1.0), faces.astype(np.int32)))
+        if k == 7:
+            path.write_bytes(b"ply\nnonsense that cannot be read, as the message says in a long sentence")
+        project.add(path, "training")
+    cells = {one.id: {"species": "Pan troglodytes", "sex": "f"} for one in project.state.specimens}
+    project.edit(None, with_cells(("species", "sex"), cells))
+    odd = "museum_of_natural_history_specimen_005"
+    with studio(project.folder, tmp_path) as address:
+        tab = open_tab(address, {"width": 1024, "height": 768})
+        user = User(tab)
+        user.sees(f"odd-{odd}")
+        tab.until("document.querySelectorAll('tbody .refused').length === 1")
+        tab.until("!document.querySelector('tbody .waiting')")
+        heights = tab.page.evaluate("[...document.querySelectorAll('tbody tr')].map((row) => row.offsetHeight)")
+        assert len(heights) == 24 and max(heights) < 36
+        assert barriers(tab) == []
+        tab.shot("table")
+        user.click("tab-correspondence")
+        user.sees("odd-link")
+        tab.page.get_by_test_id("checks").get_by_text("in cm it would have their size").wait_for()
+        user.click("odd-link")
+        user.click(f"odd-unit-{odd}")
+        tab.page.get_by_test_id("odd").wait_for(state="detached")
+        tab.until(f"document.querySelector('[data-testid=unit-{odd}]').value === 'cm'")
+    assert tab.complaints == []

@@ -91,7 +91,7 @@
     const [checks, setChecks] = useState(null);
     const [checkedFor, setCheckedFor] = useState(null); // settings of these checks; a problem of earlier ones does not keep a run back
     const [starting, setStarting] = useState(false);
-    const { columns, jobs, revision } = Studio.state.project;
+    const { columns, jobs, revision, odd } = Studio.state.project;
     const options = form ? changedOptions(form, values) : {};
     const asked = JSON.stringify([options, on]);
     useEffect(() => {
@@ -125,10 +125,10 @@
         ${form.options.filter((option) => option.visible).map(show)}
         ${folded.length > 0 && html`<details data-testid="more-options"><summary>${J.more(folded.length)}</summary>${folded.map(show)}</details>`}
         ${children}
+        ${kind === "correspond" && odd.length > 0 && html`<p class="odd"><a href="#specimens" data-testid="odd-link">${T.specimens.odd.link(odd.length)}</a></p>`}
         <button class=${strong ? "strong wide" : "wide"} data-testid=${`run-${kind}`} disabled=${disabled || starting || missing || problem}>${word}</button>
         ${/* Below the button, which they must not move while it is pressed. */ checked && html`<div class="checks" role="status" aria-label=${T.questions.checks} data-testid="checks">
-          ${checks === null ? html`<p class="hint">${T.questions.checking}</p>` : checks.map((check) => html`<p class=${check.level}><b>${T.questions.levels[check.level]}</b> ${check.text}</p>`)}
-          ${kind === "correspond" && Studio.state.project.odd.length > 0 && html`<a href="#specimens" data-testid="odd-link">${T.specimens.odd.link}</a>`}</div>`}
+          ${checks === null ? html`<p class="hint">${T.questions.checking}</p>` : checks.map((check) => html`<p class=${check.level}><b>${T.questions.levels[check.level]}</b> ${check.text}</p>`)}</div>`}
       </form>`;
   }
 

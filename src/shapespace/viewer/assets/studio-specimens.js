@@ -9,6 +9,7 @@
   const S = T.specimens;
   const { Button, Confirm, FileButton, DropZone, UploadStatus, FolderBrowser } = Studio;
   const SHOWN = 200; // specimens drawn at first, and by each "Show more"
+  const FEW = 3; // findings that are not folded
 
   const include = (specimen, box) => Studio.editBy({ what: "include", ids: [specimen.id], included: box.checked }, () => { box.checked = specimen.included; });
 
@@ -64,12 +65,15 @@
   }
 
   /** Specimens that differ from the others, each with its view and a unit in which it would not. */
-  const Odd = ({ project }) => project.odd.length > 0 && html`
-    <section class="notes" aria-label=${S.odd.title} data-testid="odd"><h3>${S.odd.title}</h3>
-      ${project.odd.map(({ id, text, unit }) => html`<p key=${id} data-testid=${`odd-${id}`}><strong>${id}</strong>: ${text}
-        ${unit && html` <${Button} edits small testid=${`odd-unit-${id}`} onclick=${() => Studio.edit({ what: "unit", ids: [id], unit })}>${S.odd.setUnit(S.unit(unit))}<//>`}
-        <${Studio.ShowScan} specimen=${project.specimens.find((one) => one.id === id)} /></p>`)}
-    </section>`;
+  const Odd = ({ project }) => {
+    const line = ({ id, text, unit }) => html`<p key=${id} data-testid=${`odd-${id}`}><strong>${id}</strong>: ${text}
+      ${unit && html` <${Button} edits small testid=${`odd-unit-${id}`} onclick=${() => Studio.edit({ what: "unit", ids: [id], unit })}>${S.odd.setUnit(S.unit(unit))}<//>`}
+      <${Studio.ShowScan} specimen=${project.specimens.find((one) => one.id === id)} /></p>`;
+    return project.odd.length > 0 && html`
+      <section class="notes" aria-label=${S.odd.title} data-testid="odd"><h3>${S.odd.title}</h3>${project.odd.slice(0, FEW).map(line)}
+        ${project.odd.length > FEW && html`<details><summary>${S.odd.more(project.odd.length - FEW)}</summary>${project.odd.slice(FEW, SHOWN).map(line)}</details>`}
+      </section>`;
+  };
 
   /** Notes on the table, and the number of specimens of each class. */
   const About = ({ project }) => html`

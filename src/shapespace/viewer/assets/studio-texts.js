@@ -54,7 +54,7 @@
         front: "Front", back: "Back", left: "Left", right: "Right", top: "Top", bottom: "Bottom", units: "units of the file",
         axes: "The axes are those of the file: front looks along -z, with y up. Drag to turn, scroll to zoom.", borders: "Red: borders of holes.",
       },
-      odd: { title: "These specimens differ from the others", setUnit: (unit) => `Set its unit to ${unit}`, link: "Go to these specimens" },
+      odd: { title: "These specimens differ from the others", setUnit: (unit) => `Set its unit to ${unit}`, link: (number) => `${count(number, "specimen differs", "specimens differ")} from the others: look at ${number === 1 ? "it" : "them"} first`, more: (number) => `${count(number, "more specimen")}` },
       groom: {
         open: "Groom", done: "groomed", title: "Groom", largest: "Keep the largest piece", outer: "Remove inner surfaces", holes: "Fill holes with border edges up to",
         hint: "The part that remains keeps its coordinates and its unit. The file of the scan stays as it is.", apply: "Groom", original: "Use the original scan", running: "Being groomed",

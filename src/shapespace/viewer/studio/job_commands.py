@@ -37,6 +37,7 @@ _STUDY = (*CORRESPONDENCES, "build", "quality", "morphospace", *QUESTIONS[:-1], 
 _INPUTS = "inputs"
 _NAMES = ("name", "files", "ids", "set")
 """Keys of the options of a job that name scans or volumes; all others are options of its command."""
+_MOST_ODD = 5  # findings on single specimens in the checks
 _TERMINAL_NOTES = re.compile(
     r" \([^()]*(?:NAME\.|MODEL\.h5|about\.json)[^()]*\)|; exit with \d [^.;]*|(?m:^(?:next|usage): .*\n?)"
 )
@@ -320,7 +321,8 @@ def checks(
         chosen = [specimen for specimen in chosen if all(specimen.cells.get(column) for column in columns)]
     found = [{"level": "ok" if len(chosen) >= 2 else "problem", "text": f"Included specimens: {len(chosen)}."}]
     if kind == "correspond":
-        return [*found, *({"level": "warning", "text": text} for text in odd)]
+        rest = [f"{len(odd) - _MOST_ODD} more specimens differ from the others."] if len(odd) > _MOST_ODD else []
+        return [*found, *({"level": "warning", "text": text} for text in (*odd[:_MOST_ODD], *rest))]
     if shapes is not None and shapes.kind in CORRESPONDENCES:
         there = _surface_files(project, shapes, chosen)
         lacking = [specimen.id for specimen in chosen if specimen.id not in there]
