@@ -91,11 +91,12 @@ def test_dropped_volumes_become_specimens_by_a_recorded_command(tmp_path: Path) 
             drop(client, nifti(tmp_path / "anna.nii.gz", balls(1, 2))),
             drop(client, nifti(tmp_path / "ben.nii.gz", balls(1))),
             drop(client, nifti(tmp_path / "other" / "anna.nii.gz", balls(2))),
+            drop(client, tmp_path / "other" / "anna.nii.gz"),
         ]
-        assert files == ["scans/anna.nii.gz", "scans/ben.nii.gz", "scans/anna-2.nii.gz"]
+        assert files == ["scans/anna.nii.gz", "scans/ben.nii.gz", "scans/anna-2.nii.gz", "scans/anna-3.nii.gz"]
         assert state(client)["specimens"] == []
         labels = [client.post("/api/labels", json={"file": file}).json() for file in files]
-        assert [[label["choice"] for label in one] for one in labels] == [["1", "2"], ["1"], ["2"]]
+        assert [[label["choice"] for label in one] for one in labels] == [["1", "2"], ["1"], ["2"], ["2"]]
         run(client, "surface", {"files": files, "set": "new", "--label": "2", "--smooth": "0.8"})
         project = until(client, lambda now: ended(now) and len(now["specimens"]) == 2)
         (job,) = project["jobs"]
@@ -103,6 +104,7 @@ def test_dropped_volumes_become_specimens_by_a_recorded_command(tmp_path: Path) 
         assert "ben.nii.gz" in job["message"] and "it has no label 2; choose from 1" in job["message"]
         assert "--label=2 --smooth=0.8" in job["command"]
         assert {(one["id"], one["set"]) for one in project["specimens"]} == {("anna", "new"), ("anna-2", "new")}
+        assert job["message"].endswith("anna-3 is the same surface as anna-2; it was not added.")
         assert "making" not in job["message"] and job["message"].startswith("scans/ben.nii.gz: ")
         project = until(client, lambda now: all(one["state"] == "ready" for one in now["specimens"]))
         assert 10 < project["specimens"][0]["extent"] < 14

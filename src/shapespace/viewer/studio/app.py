@@ -67,7 +67,6 @@ from shapespace.viewer.studio.project import (
     recent_projects,
     with_cells,
 )
-from shapespace.viewer.studio.run_job import PARTLY
 from shapespace.viewer.studio.specimen_checks import SpecimenChecks
 from shapespace.viewer.studio.views import REPORT_PAGE, Views, result_path, view_kinds
 
@@ -113,11 +112,12 @@ class OpenProject:
         """Close the project; a running job continues."""
         self._resources.close()
 
-    def _take_surfaces(self, job: Job) -> None:
-        self.project.add_surfaces(self.project.folder / job.output, _role(job.options.get("set")))
+    def _take_surfaces(self, job: Job) -> list[str]:
+        return self.project.add_surfaces(self.project.folder / job.output, _role(job.options.get("set")))
 
-    def _take_groomed(self, job: Job) -> None:
+    def _take_groomed(self, job: Job) -> list[str]:
         self.project.take_groomed(groomed_scans(job, self.project.folder))
+        return []
 
     def _result(self, number: int) -> Path | None:
         """Return the path of the result of a job; None if it has none."""
@@ -176,15 +176,14 @@ class OpenProject:
         page = f"/view/{job.number}/"
         pages = [page, *(f"{page}{REPORT_PAGE}/" for _ in kinds[1:])]
         sentences, methods = ([], None) if path is None else _words(path)
-        is_partly = job.kind in ("surface", "groom") and job.code == PARTLY
-        message = (is_partly and self.jobs.problems(job)) or job.message
+        problems = self.jobs.problems(job) if job.kind in ("surface", "groom") and job.status == "done" else ""
         return {
             "number": job.number, "kind": job.kind, "command": job.command, "status": job.status,
-            "message": self._sentence(message), "progress": progress, "seconds": self.jobs.running_for(job),
-            "left_s": left_s, "output": job.output, "options": job.options, "on": job.on,
+            "message": self._sentence(problems or job.message), "progress": progress,
+            "seconds": self.jobs.running_for(job), "left_s": left_s, "output": job.output, "options": job.options, "on": job.on,
             "views": [{"kind": kind, "href": href} for kind, href in zip(kinds, pages, strict=False)],
             "sentences": list(map(self._sentence, sentences)), "methods": methods and self._sentence(methods),
-            "outdated": self._outdated[1].get(job.number), "partly": is_partly,
+            "outdated": self._outdated[1].get(job.number), "partly": bool(problems),
             # A command that rejected its input would reject it again.
             "can_continue": job.status in ("cancelled", "interrupted") or (job.status == "failed" and job.code != 2),
         }  # fmt: skip

@@ -7,7 +7,7 @@ import json
 import shlex
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -23,7 +23,7 @@ from shapespace.viewer.studio.run_job import CANCEL, EXIT, JOB, LOG, PARTLY, PRO
 Status = Literal["waiting", "running", "done", "failed", "cancelled", "interrupted"]
 FOLDER = "jobs"
 TAKEN = "taken"
-"""File in the folder of a job whose result was taken into the project."""
+"""File in the folder of a job whose result was taken into the project, with sentences on parts that were not."""
 _POLL_S = 0.3  # between looks at the running job
 _START_S = 30.0  # after which a process that does not lock its folder has failed to start
 _LOG_END = 4000  # bytes of the log in which the last message is searched
@@ -107,14 +107,18 @@ class Jobs:
         folder: folder of the project.
         changed: function that is called when a job changed.
         takers: kind of a job -> function that takes the result of such a job into the project, called once after it
-            succeeded, also if the studio was closed then.
+            succeeded, also if the studio was closed then; it returns sentences on the parts that were not taken.
         read_only: whether to only read the jobs; nothing is started or written.
     """
 
     def __init__(
-        self, folder: Path, changed: Callable[[], None], takers: Mapping[str, Callable[[Job], None]] | None = None,
-        *, read_only: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        folder: Path,
+        changed: Callable[[], None],
+        takers: Mapping[str, Callable[[Job], Sequence[str]]] | None = None,
+        *,
+        read_only: bool = False,
+    ) -> None:
         self._folder = folder / FOLDER
         self._takers = takers or {}
         self._changed = changed
@@ -205,9 +209,15 @@ class Jobs:
             return ""
 
     def problems(self, job: Job) -> str:
-        """Return the messages of a command on inputs that it could not use."""
-        lines = self.log(job.number).splitlines()
-        return " ".join(line.removeprefix(_PROGRAM) for line in lines if line.startswith(_PROGRAM))
+        """Return the messages on inputs that a command could not use, and on results that were not taken."""
+        messages = [
+            line.removeprefix(_PROGRAM)
+            for line in self.log(job.number).splitlines()
+            if line.startswith(_PROGRAM) and not line.endswith("...")
+        ]  # progress ends so
+        with contextlib.suppress(OSError):
+            messages.append((self.folder_of(job) / TAKEN).read_text(encoding="utf-8"))
+        return " ".join(filter(None, messages))
 
     def progress(self, job: Job) -> dict[str, Any] | None:
         """Return the progress of a running job (`doing`, `done`, `total`, `left_s`); None if it is unknown."""
@@ -274,8 +284,7 @@ class Jobs:
         taken = self.folder_of(job) / TAKEN
         if job.status == "done" and job.kind in self._takers and not taken.exists():
             with contextlib.suppress(ShapespaceError, OSError):
-                self._takers[job.kind](job)
-                taken.touch()
+                write_text(taken, " ".join(self._takers[job.kind](job)))
 
     def _write_history(self) -> None:
         """Write `history.sh` into the project's folder; a full disk does not prevent the end of a job."""

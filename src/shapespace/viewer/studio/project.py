@@ -333,10 +333,10 @@ class Project:
 
     # Results that become scans
 
-    def add_surfaces(self, folder: Path, role: Role) -> None:
-        """Add the meshes in a folder of the project, such as surfaces of label volumes."""
-        for file in sorted(folder.glob("*.ply")):
-            self.add(file, role)
+    def add_surfaces(self, folder: Path, role: Role) -> list[str]:
+        """Add the surfaces of label volumes in a folder of the project; return sentences on those not added."""
+        added = [(file.stem, self.add(file, role)[1]) for file in sorted(folder.glob("*.ply"))]
+        return [f"{name} is the same surface as {same}; it was not added." for name, same in added if same is not None]
 
     def take_groomed(self, groomed: Mapping[str, str]) -> None:
         """Use groomed scans; a specimen whose scan was changed since the start of the grooming keeps its scan.
