@@ -14,6 +14,9 @@ from shapespace.correspondence.correspondence_result import ENOUGH_TO_COMPARE, L
 from shapespace.geometry.normals import face_areas, rms_size
 from shapespace.types import MM_PER_UNIT, FloatArray, Mesh
 
+_UNSEEN = 6.0
+"""Share of the range of N sizes by which the sizes of more scans may be beyond it on each side, times N; the share is a
+half at least. With it, a wrong unit was named in 2 of 10,500 simulated collections (benchmarks/odd_scans.py)."""
 _POINTS = 2000  # of a surface; the distances of 1000 x 1000 pairs
 _QUANTILES = (np.arange(16) + 0.5) / 16
 _ODD_SHAPE, _GAP = 6.0, 2.0
@@ -89,8 +92,8 @@ def find_odd_scans(measures: Sequence[ScanMeasures], units: Sequence[str]) -> di
 
     A size is odd if it is more than twice or less than half the median of the others, and farther from their sizes than
     these are from each other. A unit is named if this unit alone would bring the size among those of the
-    others, and if the difference cannot be natural: the shape is usual, and the gap to the others is wider than twice
-    their range.
+    others, and if the difference cannot be natural: the shape is usual, and the gap to the others is wider than
+    their range, also that of more scans like them.
 
     Args:
         measures: measures of the scans.
@@ -109,7 +112,7 @@ def find_odd_scans(measures: Sequence[ScanMeasures], units: Sequence[str]) -> di
         low, high, middle = float(others.min()), float(others.max()), float(np.median(others))
         gap, width = max(low - sizes[k], sizes[k] - high), high - low
         is_odd = gap > width and abs(sizes[k] - middle) > np.log(OTHER_SIZE)
-        margin = 0.5 * width  # a few scans do not show the full range
+        margin = width * max(0.5, _UNSEEN / len(others))
         changes = {unit: float(np.log(length / mm[k])) for unit, length in MM_PER_UNIT.items()}
         fitting = [
             unit

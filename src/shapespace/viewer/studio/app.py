@@ -180,7 +180,8 @@ class OpenProject:
         return {
             "number": job.number, "kind": job.kind, "command": job.command, "status": job.status,
             "message": self._sentence(problems or job.message), "progress": progress,
-            "seconds": self.jobs.running_for(job), "left_s": left_s, "output": job.output, "options": job.options, "on": job.on,
+            "seconds": self.jobs.running_for(job), "left_s": left_s, "output": job.output,
+            "options": job.options, "on": job.on,
             "views": [{"kind": kind, "href": href} for kind, href in zip(kinds, pages, strict=False)],
             "sentences": list(map(self._sentence, sentences)), "methods": methods and self._sentence(methods),
             "outdated": self._outdated[1].get(job.number), "partly": bool(problems),
