@@ -147,8 +147,8 @@ def test_only_holes_with_few_edges_are_filled() -> None:
     ({"crop": ("sphere:1,2,3",)}, "There is no crop 'sphere:1,2,3'"),
     ({"crop": ("plane:0,0,0,0,0,0",)}, "normal that is not zero"),
     ({"crop": ("landmarks:30",)}, "needs the landmarks of a fit"),
-    ({"fill_holes": 2}, "from 3 to 1000"),
-    ({"fill_holes": 10**9}, "from 3 to 1000"),
+    ({"fill_holes": 2}, "from 3 to 500"),
+    ({"fill_holes": 10**9}, "from 3 to 500"),
 ])  # fmt: skip
 def test_settings_that_cannot_be_are_rejected(grooming: dict[str, object], message: str) -> None:
     with pytest.raises(InputError, match=message):

@@ -126,18 +126,16 @@ class OpenProject:
 
     def odd_scans(self) -> dict[str, OddScan]:
         """Return the included specimens that differ from the others in size or shape, by their ids."""
-        names: list[str] = []
-        units: list[str] = []
-        measures: list[ScanMeasures] = []
-        for specimen in self.project.state.specimens:
-            facts = self.checks.facts(self.project.path(specimen)) if specimen.included else None
-            if facts is not None and "profile" in facts:
-                names.append(specimen.id)
-                units.append(specimen.unit or "mm")
-                measures.append(ScanMeasures(facts["size"], np.array(facts["profile"])))
-        key = (names, units, [measure.size for measure in measures])
+        included = [specimen for specimen in self.project.state.specimens if specimen.included]
+        facts = [self.checks.facts(self.project.path(specimen)) or {} for specimen in included]
+        key = [
+            (specimen.id, specimen.unit or "mm", fact["size"], fact["profile"])
+            for specimen, fact in zip(included, facts, strict=True) if "profile" in fact
+        ]  # fmt: skip
         if key != self._odd[0]:
-            self._odd = key, {names[k]: odd for k, odd in find_odd_scans(measures, units).items()}
+            measures = [ScanMeasures(size, np.array(profile)) for _, _, size, profile in key]
+            found = find_odd_scans(measures, [unit for _, unit, _, _ in key])
+            self._odd = key, {key[k][0]: odd for k, odd in found.items()}
         return self._odd[1]
 
     def facts(self) -> dict[str, Any]:
