@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from shapespace.correspondence.odd_scans import ScanMeasures, find_odd_scans
+from shapespace.correspondence.odd_scans import ScanMeasures, _medians_of_others, find_odd_scans
 from shapespace.datasets.bones import Bone
 from shapespace.datasets.faces import load_faces
 from shapespace.datasets.organs import Organ, raw_surface
@@ -116,3 +116,11 @@ def test_few_or_equal_scans_are_not_compared() -> None:
     assert find_odd_scans([own[0]] * COUNT, mm()) == {}
     half = find_odd_scans([scaled(one, 0.1 if k % 2 else 1.0) for k, one in enumerate(own)], mm())
     assert sorted(half) == list(range(1, COUNT, 2)) and {one.unit for one in half.values()} == {"cm"}
+
+
+def test_the_median_of_the_others_is_that_without_the_row() -> None:
+    rng = np.random.default_rng(0)
+    for count in (2, 3, 4, 7, 10):
+        values = rng.integers(0, 5, (count, 6)).astype(np.float64)  # with equal numbers
+        wanted = [np.median(np.delete(values, k, axis=0), axis=0) for k in range(count)]
+        assert np.array_equal(_medians_of_others(values), wanted)

@@ -128,14 +128,17 @@ def find_odd_scans(measures: Sequence[ScanMeasures], units: Sequence[str]) -> di
 
 def _shape_ratios(profiles: FloatArray) -> FloatArray:
     """Return (N,) distances of profiles (N, 16) from the others' median, in medians of all; 1 for usual ones."""
-    distances = np.array([_profile_distance(profiles, k) for k in range(len(profiles))])
+    distances = np.sqrt(((profiles - _medians_of_others(profiles)) ** 2).mean(axis=1))
     distances /= max(float(np.median(distances)), 1e-12)
     ordered = np.asarray(np.sort(distances), dtype=np.float64)
     beyond = ordered[1:][(ordered[1:] > _GAP * ordered[:-1]) & (ordered[1:] > _ODD_SHAPE)]
     return np.where(distances >= (beyond[0] if len(beyond) else np.inf), distances, 1.0)
 
 
-def _profile_distance(profiles: FloatArray, k: int) -> float:
-    """Return the RMS distance of one of the `profiles` (N, 16) from the median of the others."""
-    middle: FloatArray = np.median(np.delete(profiles, k, axis=0), axis=0)
-    return float(np.sqrt(((profiles[k] - middle) ** 2).mean()))
+def _medians_of_others(values: FloatArray) -> FloatArray:
+    """Return the median of the other rows for each row of `values` (N, K), column by column."""
+    order = values.argsort(axis=0)
+    rank, ordered = order.argsort(axis=0), np.take_along_axis(values, order, axis=0)
+    middles = ((len(values) - 2) // 2, (len(values) - 1) // 2)
+    low, high = (np.take_along_axis(ordered, middle + (rank <= middle), axis=0) for middle in middles)
+    return 0.5 * (low + high)

@@ -194,14 +194,14 @@
     Studio.changed();
   }
 
-  function checkSize(file) {
+  function checkSize(file, tooLarge) {
     const most = Studio.state.upload_bytes;
-    if (file.size > most) throw new Error(T.uploads.tooLarge(file.name, Math.round(most / 2 ** 20)));
+    if (file.size > most) throw new Error(tooLarge(file.name, Math.round(most / 2 ** 20)));
   }
 
   /** Add a label volume; its labels are asked for when all files of the drop are there. */
   async function uploadVolume(file, set) {
-    checkSize(file);
+    checkSize(file, T.uploads.volumeTooLarge);
     const { file: stored } = await json(`/api/volumes?name=${encodeURIComponent(file.name)}`, { method: "PUT", body: file });
     Studio.volumes.push({ file: stored, name: file.name, set });
     Studio.volumes.sort((a, b) => byName(a.name, b.name));
@@ -209,7 +209,7 @@
 
   async function uploadScan(file, set) {
     if (!ending(file.name, Studio.state.formats)) throw new Error(T.uploads.format(file.name));
-    checkSize(file);
+    checkSize(file, T.uploads.tooLarge);
     const answer = await json(`/api/specimens?name=${encodeURIComponent(file.name)}&set=${set}`, { method: "PUT", body: file });
     if (answer.same_as) Studio.uploads.notes.push(T.uploads.same(file.name, answer.same_as));
     else Studio.uploads.added += 1;

@@ -82,7 +82,7 @@
     },
     uploads: {
       progress: (done, total) => `Adding file ${Math.min(done + 1, total)} of ${total}`, finished: (added) => `${count(added, "file")} added.`,
-      leftOut: (number) => `${count(number, "file")} not added`, tooLarge: (name, limit) => `${name} is larger than ${limit} MB; add it from this machine instead.`,
+      leftOut: (number) => `${count(number, "file")} not added`, tooLarge: (name, limit) => `${name} is larger than ${limit} MB; add it from this machine instead.`, volumeTooLarge: (name, limit) => `${name} is larger than ${limit} MB; crop it to the object, for example in 3D Slicer.`,
       format: (name) => `${name} is not a scan in a format that can be read.`, same: (name, other) => `${name} has the same content as ${other}.`,
       table: (name, matched) => `${name}: cells of ${count(matched, "specimen")} read.`, dismiss: "Close the list",
     },
