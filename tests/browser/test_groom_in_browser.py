@@ -1,6 +1,7 @@
 """Label volumes and grooming by clicks: what a user drops, chooses and crops becomes a command and its result."""
 
 import json
+import time
 from pathlib import Path
 
 import nibabel
@@ -115,7 +116,11 @@ def test_scans_are_groomed_by_clicks_and_the_originals_come_back(open_tab, tmp_p
         tab.shot("sphere")
         assert not barriers(tab)
         user.click("groom-apply")
-        tab.page.get_by_test_id("scan").wait_for(state="detached")
+        ends = time.monotonic() + 60
+        while specimens(project)["bone_0"]["file"] != "groomed/0002/bone_0.ply":
+            assert time.monotonic() < ends
+            tab.page.wait_for_timeout(100)
+        tab.page.wait_for_timeout(1500)  # until the page has this state; its view then shows the other file
         tab.page.locator("[data-testid=scan-view][data-ready=true]").wait_for()
         tab.page.wait_for_timeout(600)
         tab.shot("cropped")

@@ -186,6 +186,8 @@ def test_a_groomed_scan_can_be_replaced_by_its_original_after_a_restart(tmp_path
     with studio(tmp_path / "p") as client:
         project = state(client)
         assert project["undo"] is None and project["specimens"][0]["groomed"]
+        again = client.put("/api/specimens", params={"name": "x.ply"}, content=(tmp_path / "ball.ply").read_bytes())
+        assert again.json() == {"id": "ball", "same_as": "ball"}
         client.post("/api/edit", json={"what": "original", "ids": ["ball"], "revision": project["revision"]})
         (ball,) = state(client)["specimens"]
         assert ball["file"] == "scans/ball.ply" and not ball["groomed"]

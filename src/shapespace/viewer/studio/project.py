@@ -281,8 +281,14 @@ class Project:
         with self._lock:
             try:
                 size = file.stat().st_size
-                for existing in self.state.specimens:
-                    other = self.path(existing)
+                scans = [
+                    (specimen, place)
+                    for specimen in self.state.specimens
+                    for place in (specimen.file, specimen.original)
+                    if place
+                ]
+                for existing, place in scans:
+                    other = self.folder / place
                     if other.is_file() and other.stat().st_size == size and filecmp.cmp(file, other, shallow=False):
                         return existing.id, existing.id
             except OSError as error:
