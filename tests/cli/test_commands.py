@@ -187,6 +187,30 @@ def test_check_writes_symmetric_meshes_and_names_files_without_symmetry(run: Run
     assert "--symmetric" in run("check", skull, "--symmetric").sentence()
 
 
+def test_check_writes_groomed_meshes_in_the_frame_and_unit_of_the_file(run: Run, world: World, tmp_path: Path) -> None:
+    scan = read_mesh(world.scan)
+    assert scan.faces is not None
+    far = scan.vertices.max(axis=0) + 500.0
+    bits = Mesh(far + np.eye(4, 3), np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32))
+    faces = np.concatenate([scan.faces, bits.faces + len(scan.vertices)]).astype(np.int32)
+    write_mesh(tmp_path / "dirty.ply", Mesh(np.concatenate([scan.vertices, bits.vertices]), faces))
+    (report,) = run("check", tmp_path / "dirty.ply", "-o", tmp_path / "out", "--largest", "--json").facts
+    assert report["findings"][-1]["what"] == "It has 2 separate pieces."
+    written = read_mesh(Path(report["written"]))
+    assert written.faces is not None
+    assert np.array_equal(written.vertices, scan.vertices) and np.array_equal(written.faces, scan.faces)
+    crop = f"sphere:{','.join(map(str, far))},3"
+    again = ("check", world.scan, tmp_path / "dirty.ply", "-o", tmp_path / "out", f"--crop={crop}", "--unit", "cm")
+    outcome = run(*again, "--json")
+    assert outcome.code == 1 and "leaves 0 of its 1000 vertices" in outcome.sentence()
+    assert np.array_equal(read_mesh(tmp_path / "out" / "dirty.ply").vertices, 10.0 * bits.vertices)
+    assert not (tmp_path / "out" / world.scan.name).exists()
+    assert "apply to the meshes that are written" in run("check", world.scan, "--fill-holes", "30").sentence()
+    assert (
+        "There is no crop 'ball:1'" in run("check", world.scan, "-o", tmp_path / "out", "--crop", "ball:1").sentence()
+    )
+
+
 def test_check_overwrites_no_mesh_that_it_reads(run: Run, world: World, tmp_path: Path) -> None:
     scan = tmp_path / "scan.ply"
     scan.write_bytes(world.scan.read_bytes())

@@ -365,6 +365,8 @@ def test_each_action_is_a_command_line_that_the_parser_takes(project: Project, t
         for one in described[kind]["options"]
         if one["required"] or one["kind"] in ("class", "formula") or one["flag"] == "--along"
     }
+    named = {"surface": {"files": ["scans/mask.nii.gz"]}, "groom": {"ids": ["anna"], "--largest": True}}
+    options |= named.get(kind, {})
     ordered = order(project, done, described, kind, options, None, 5)
     arguments = parser().parse_args(ordered.arguments)
     assert callable(arguments.run)

@@ -44,6 +44,7 @@ ORGANS = Source("commands.data", "write_simulated_organs")
 BONES = Source("commands.data", "write_simulated_bones")
 SKULLS = Source("commands.data", "write_simulated_landmarks")
 SURFACE = Source("commands.surface", "write_surfaces")
+GROOMING = Source("geometry.grooming", "Grooming")
 LANDMARKS_TRANSFER = Source("commands.landmarks", "transfer_landmarks")
 LANDMARKS = Source("commands.landmarks", "suggest_specimens")
 LANDMARKS_CONVERT = Source("commands.landmark_data", "convert_landmarks")
@@ -356,18 +357,27 @@ COMMANDS: tuple[CommandSpec, ...] = (
         "check",
         "check meshes: contents, defects, and their repair before a fit",
         ("shapespace check scan.obj", "shapespace check left_bones -o mirrored --mirror --unit cm",
+         "shapespace check skulls -o groomed --outer --largest --fill-holes 30",
          "shapespace check template.ply -o symmetric --symmetric"), "commands.look:check",
         (
             basic("files", "FILE", "mesh files, or folders of them", nargs="+", parse=Path),
             basic("-o --output", "DIR", "output folder for the repaired meshes in mm, as NAME.ply", parse=Path),
             basic("--unit", "UNIT", "unit of the files, for -o (default: mm)", choices=_UNITS),
+            basic("--crop", "KIND:NUMBERS", source=GROOMING, parse=str, repeat=True, default=[]),
+            basic("--outer", source=GROOMING),
+            basic("--largest", source=GROOMING),
+            basic("--fill-holes", "N", source=GROOMING, parse=values.positive),
             basic("--mirror", help="write mirror images, such as of left bones among right ones"),
-            basic("--symmetric", help="write symmetric meshes, as templates: the mean of each mesh and its mirror "
-                  "image, with vertices in left and right pairs and on the midline"),
-            basic("--recursive", help="also search subfolders of the given folders"),
-            basic("--strict", help=_STRICT_HELP),
+            advanced("--symmetric", help="write symmetric meshes, as templates: the mean of each mesh and its mirror "
+                     "image, with vertices in left and right pairs and on the midline"),
+            advanced("--recursive", help="also search subfolders of the given folders"),
+            advanced("--strict", help=_STRICT_HELP),
         ),
         (
+            "With -o, a mesh is repaired, then cropped, reduced to its outer surface and to its largest piece, and its "
+            "holes are filled, in this order, if these options are given. None of this moves a vertex. --unit "
+            "multiplies the coordinates by the length of the unit in mm, and --mirror reflects them at x = 0; without "
+            "both, the written coordinates are exactly those of the file, so that landmarks on the scan stay valid.",
             "The report of a file lists defects that a fit repairs (fixed), notes, and defects that make the file "
             "unusable. The exit code is 0 if all files can be used, 1 if some can, 2 if none can.",
         ),

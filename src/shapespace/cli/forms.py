@@ -13,9 +13,12 @@ from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS
 _KINDS: Mapping[str, str] = {
     "identify": "recognise identify",
     "landmarks": "landmarks convert",
+    "groom": "check",
     **{test.name: f"test {test.name}" for test in SHAPE_TESTS},
 }
 _FIRST: Mapping[str, tuple[str, ...]] = {
+    "surface": ("--label", "--smooth"),
+    "groom": ("--crop", "--outer", "--largest", "--fill-holes"),
     "correspond": ("--vertices", "--mirror", "--pose"),
     "figures": ("--format",),
     "build": ("--modes", "--gauge", "--unit"),
@@ -54,6 +57,7 @@ _FILES = frozenset(
 
 
 _ACTIONS: Mapping[str, str] = {
+    "surface": "Surfaces of label volumes", "groom": "Groom scans",
     "correspond": "Correspondence", "build": "Build the model", "quality": "Measure the quality",
     "morphospace": "Draw the morphospace", "figures": "Draw figures for print", "fit": "Fit the model",
     "complete": "Complete partial scans", "compare": "Do groups differ?", "change": "Has it changed?",
@@ -89,6 +93,9 @@ _LABELS: Mapping[str, str] = {
     "formula": "Formula", "gallery": "Scans to enrol", "gauge": "Size handling", "geometry": "Surface or landmarks",
     "group": "Groups", "hold": "Class of another column", "ignore-colours": "Ignore colours",
     "imputations": "Samples of completed shapes", "jobs": "Parallel computations", "keep-shapes": "Keep aligned shapes",
+    "keep-pieces": "Keep all pieces and cavities", "label": "Labels", "largest": "Keep the largest piece",
+    "fill-holes": "Fill holes with border edges up to", "smooth": "Smoothing (voxels)",
+    "max-memory": "Memory limit", "symmetric": "Symmetric mesh",
     "landmark-stddev-mm": "Standard deviation of landmarks (mm)", "landmarks": "Landmarks",
     "landmark-uncertainty": "Standard deviation of landmarks (share of size)", "length": "Predicted length",
     "level": "Significance level", "licence": "Licence", "maps": "Test each vertex",
@@ -127,6 +134,8 @@ def forms(commands: Mapping[str, tuple[str, Sequence[Option]]]) -> dict[str, dic
             "command": tuple(command.split()), "label": _ACTIONS[kind], "is_question": kind in _QUESTIONS,
             **_make_form(kind, *commands[command], first)
         }  # fmt: skip
+    # Other options of this command change the unit or the side, which are set for each specimen.
+    made["groom"]["options"] = [option for option in made["groom"]["options"] if option["visible"]]
     made["convert"]["options"][0] |= {"kind": "choice", "choices": list(MODEL_FORMATS)}
     made["landmarks"]["options"][0] |= {
         "kind": "choice", "choices": [*CONFIGURATION_FORMATS, *FOLDER_FORMATS], "initial": "csv",

@@ -14,7 +14,8 @@ from shapespace.batch.fit_work import naming
 from shapespace.batch.result_folder import names_for
 from shapespace.commands.outcome import Outcome, exit_code_of, short
 from shapespace.errors import FileError, InputError, ShapespaceError
-from shapespace.geometry.doctor import examine, examine_and_repair
+from shapespace.geometry.doctor import Finding, examine, examine_and_repair, repair
+from shapespace.geometry.grooming import NO_GROOMING, Grooming
 from shapespace.geometry.mirror_plane import mirror_image
 from shapespace.geometry.normals import faces_of
 from shapespace.io.files import make_folder, remove_file
@@ -41,6 +42,7 @@ def check(
     unit: str | None = None,
     mirror: bool = False,
     symmetric: bool = False,
+    grooming: Grooming = NO_GROOMING,
     say: Callable[[str], None],
 ) -> Outcome:
     """Return the content of each mesh file, its problems, and how fitting will handle them.
@@ -55,15 +57,17 @@ def check(
         unit: unit of the files, a name of `MM_PER_UNIT` (default: mm).
         mirror: write mirror images, such as of left bones among right ones.
         symmetric: write symmetric meshes, for templates with left and right pairs of vertices; see `symmetrise`.
+        grooming: parts that are removed or filled in the meshes that are written, before all other changes.
         say: called with each message on skipped files.
 
     Raises:
-        InputError: `unit`, `mirror` or `symmetric` without `output`, or `output` contains the files.
+        InputError: `unit`, `mirror`, `symmetric` or `grooming` without `output`, or `output` contains the files.
         FileError: `output` cannot be written.
     """
-    if output is None and (unit is not None or mirror or symmetric):
+    if output is None and (unit is not None or mirror or symmetric or grooming != NO_GROOMING):
         raise InputError(
-            "--unit, --mirror and --symmetric apply to the meshes that are written; give their folder with -o."
+            "--unit, --mirror, --symmetric, --crop, --outer, --largest and --fill-holes apply to the meshes that are "
+            "written; give their folder with -o."
         )
     reports: list[dict[str, Any]] = []
     listed = mesh_files(files, recursive=recursive, apart_from=output)
@@ -84,7 +88,11 @@ def check(
             mesh = read_mesh(path)
             report, repaired = examine_and_repair(mesh, strict=strict)
             facts: dict[str, Any] = {}
+            groomed: tuple[Finding, ...] = ()
             if repaired is not None and path in targets:
+                if grooming != NO_GROOMING:
+                    repaired, groomed = grooming.apply(repaired)
+                    repaired, _ = repair(repaired)  # a part of a scan may be too small
                 repaired = replace(repaired, vertices=MM_PER_UNIT[unit or "mm"] * repaired.vertices, landmarks={})
                 if symmetric:
                     repaired, facts = _symmetrise(repaired)
@@ -94,7 +102,8 @@ def check(
             reports.append({"file": str(path), "usable": False, "error": reason})
             continue
         findings = [
-            {"level": finding.level, "what": finding.problem, "action": finding.action} for finding in report.findings
+            {"level": finding.level, "what": finding.problem, "action": finding.action}
+            for finding in (*report.findings, *groomed)
         ]
         findings += [{"level": "note", "what": note, "action": ""} for note in mesh.notes]
         usable = {"usable": repaired is not None}

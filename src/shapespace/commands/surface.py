@@ -16,13 +16,10 @@ from shapespace.commands.outcome import LISTED, Outcome, exit_code_of, first_lin
 from shapespace.errors import ShapespaceError
 from shapespace.geometry.volume_surface import SMOOTH, VolumeSurface, surface_of_volume
 from shapespace.io.files import make_folder, remove_file
-from shapespace.io.memory_cache import available_bytes
 from shapespace.io.meshes.mesh_io import mesh_files, write_mesh
-from shapespace.io.volume_io import VOLUME_ENDINGS, read_volume, require_volumes_extra, volume_name
-from shapespace.types import MAX_MEMORY_BYTES
+from shapespace.io.volume_io import VOLUME_ENDINGS, default_limit_bytes, read_volume, require_volumes_extra, volume_name
 
 _MANY = 4  # surfaces; a median of fewer does not show what is usual
-_MOST_OF_MEMORY = 0.8  # share of the free memory; the rest is for other processes
 _OTHER_SIZE = 0.02  # relative difference of voxel sizes beyond rounding in image headers
 _OTHER_VOLUME = 4.0  # ratio to the median volume; beyond it probably another object
 
@@ -67,9 +64,7 @@ def write_surfaces(
     make_folder(output)
     files = list({path.resolve(): path for path in listed.files}.values())
     records: list[dict[str, Any]] = []
-    free = available_bytes()
-    usual = MAX_MEMORY_BYTES if free is None else min(MAX_MEMORY_BYTES, int(_MOST_OF_MEMORY * free))
-    limit = usual if max_memory_bytes is None else max_memory_bytes
+    limit = default_limit_bytes() if max_memory_bytes is None else max_memory_bytes
     with progress(len(files), "making", "surface", quiet=quiet) as bar:
         for path, name in zip(files, _names(files), strict=True):
             target = output / f"{name}.ply"

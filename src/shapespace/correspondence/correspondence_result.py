@@ -196,11 +196,11 @@ class Correspondence:
 
 _EQUAL = 1e-4
 """RMS distance, as a share of the size: the precision of coordinates stored as float32 far from the origin."""
-_LEAST_RATIO = 8.0
+LEAST_RATIO = 8.0
 """Ratio of sizes that two objects of one kind do not reach, so that a larger ratio is a ratio of units."""
 _UNITS = np.array(list(MM_PER_UNIT.values()))
 _RATIOS = np.unique((_UNITS[:, None] / _UNITS).ravel())
-_RATIOS = _RATIOS[(_RATIOS == 1.0) | (np.abs(np.log(_RATIOS)) > np.log(_LEAST_RATIO))]
+_RATIOS = _RATIOS[(_RATIOS == 1.0) | (np.abs(np.log(_RATIOS)) > np.log(LEAST_RATIO))]
 
 
 def copies(scans: Sequence[Mesh]) -> dict[int, int]:
@@ -237,7 +237,7 @@ def unit_ratios(scales: Sequence[float]) -> tuple[FloatArray, FloatArray]:
         in terms of coordinates, such as 0.001 for metres among millimetres; 1 for most.
     """
     logs = np.log(np.asarray(scales, dtype=np.float64))
-    near = np.abs(logs[:, None] - logs) < 0.5 * np.log(_LEAST_RATIO)
+    near = np.abs(logs[:, None] - logs) < 0.5 * np.log(LEAST_RATIO)
     # If two units are equally frequent, the smaller unit counts as usual.
     most = max(range(len(logs)), key=lambda i: (int(near[i].sum()), logs[i]))
     relative = logs - np.median(logs[near[most]])
@@ -245,8 +245,8 @@ def unit_ratios(scales: Sequence[float]) -> tuple[FloatArray, FloatArray]:
     return np.exp(relative) / ratios, ratios
 
 
-_OTHER_SIZE = 2.0  # ratio of sizes: beyond twice the median a scan is probably of another object or unit
-_ENOUGH_TO_COMPARE, _FAR = 4, 3.0
+OTHER_SIZE = 2.0  # ratio of sizes: beyond twice the median a scan is probably of another object or unit
+ENOUGH_TO_COMPARE, _FAR = 4, 3.0
 """Ratio to the usual distance (95 % of both directions), relative to size, above which a surface is unusual."""
 
 
@@ -270,7 +270,7 @@ def judge_collection(
     far = np.array([(scan.distance[1] or np.nan) / (scan.scale * scan.unit_ratio) for scan in every])
     is_cloud = np.array([scan.area_share is None for scan in every])
     for alike in (is_cloud, ~is_cloud):
-        if np.isfinite(far[alike]).sum() >= _ENOUGH_TO_COMPARE:
+        if np.isfinite(far[alike]).sum() >= ENOUGH_TO_COMPARE:
             for k in np.flatnonzero(alike & (far / np.nanmedian(far[alike]) > _FAR)).tolist():
                 times = far[k] / np.nanmedian(far[alike])
                 every[k] = every[k].noting(
@@ -289,7 +289,7 @@ def _add_sizes(scans: Sequence[Corresponding], earlier: Sequence[Corresponding])
         scales, ratios = unit_ratios([*usual, *usual, *(own[k] for k in group)])  # the others are most
         for k, scale, ratio in zip(group, scales[-len(group) :].tolist(), ratios[-len(group) :].tolist(), strict=True):
             sized[k] = replace(scans[k], scale=scale, unit_ratio=ratio)
-            if not 1 / _OTHER_SIZE < scale < _OTHER_SIZE:
+            if not 1 / OTHER_SIZE < scale < OTHER_SIZE:
                 sized[k] = sized[k].noting(
                     f"It is {scale:.2g} times as large as most; check whether it is the same kind of object."
                 )

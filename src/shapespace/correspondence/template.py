@@ -10,8 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from threadpoolctl import threadpool_limits
 
 from shapespace.correspondence.harmonics import Harmonics
@@ -21,6 +19,7 @@ from shapespace.errors import MeshError, ShapespaceError
 from shapespace.fit.search.initialisation import Start, start_from_any_pose, start_near_frame
 from shapespace.geometry import remesh
 from shapespace.geometry.doctor import repair
+from shapespace.geometry.grooming import closed_borders, pieces_of
 from shapespace.geometry.normals import boundary_edges, face_areas, faces_of, rms_size, without_vertices
 from shapespace.geometry.outer_surface import hidden_share, outer_surface
 from shapespace.geometry.similarity import small_poses
@@ -254,9 +253,7 @@ def _incompleteness(scan: Mesh) -> float:
 
 
 def _largest_piece(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
-    flat = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
-    graph = coo_array((np.ones(len(flat)), (flat[:, 0], flat[:, 1])), shape=(len(vertices), len(vertices)))
-    _, piece = connected_components(graph, directed=False)
+    _, piece = pieces_of(faces, len(vertices))
     largest = np.bincount(piece[faces[:, 0]]).argmax()
     return without_vertices(vertices, faces, piece == largest)
 
@@ -270,7 +267,9 @@ def _without_branches(faces: IntArray) -> IntArray:
 
 
 def _small_holes(vertices: FloatArray, faces: IntArray) -> list[IntArray]:
-    loops = _borders(faces)
+    loops = closed_borders(faces)
+    passed = np.bincount(np.concatenate(loops)) if loops else np.zeros(0, np.int64)
+    loops = [loop for loop in loops if (passed[loop] == 1).all()]  # borders that touch are not holes of a sheet
     length = np.array([np.linalg.norm(vertices[loop] - vertices[np.roll(loop, 1)], axis=1).sum() for loop in loops])
     if not len(length):
         return []
@@ -278,23 +277,3 @@ def _small_holes(vertices: FloatArray, faces: IntArray) -> list[IntArray]:
     most = np.full(len(loops), _SMALL_HOLE * around)
     most[length.argmax()] = _LONGEST_HOLE * around
     return [loop for loop, own, limit in zip(loops, length, most, strict=True) if own < limit and len(loop) >= 3]
-
-
-def _borders(faces: IntArray) -> list[IntArray]:
-    """Return the closed borders that meet no other, each (n,) in the direction of its triangles."""
-    count = int(faces.max()) + 1
-    ends = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
-    lone = ~np.isin(ends[:, 1] * count + ends[:, 0], ends[:, 0] * count + ends[:, 1])
-    start, end = ends[lone].T
-    simple = np.bincount(start, minlength=count) == 1
-    following = {int(a): int(b) for a, b in zip(start, end, strict=True) if simple[a] and simple[b]}
-    loops: list[IntArray] = []
-    while following:
-        first = next(iter(following))
-        loop, vertex = [first], following.pop(first)
-        while vertex in following:
-            loop.append(vertex)
-            vertex = following.pop(vertex)
-        if vertex == first:
-            loops.append(np.array(loop, dtype=np.int32))
-    return loops

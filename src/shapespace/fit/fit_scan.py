@@ -22,7 +22,7 @@ from shapespace.fit.method_choices import method_named
 from shapespace.fit.result import FitResult, Stage
 from shapespace.fit.robust.prepared_model import SHARE, LandmarkConstraint
 from shapespace.fit.robust.robust_settings import DenseSettings
-from shapespace.fit.scan_target import Crop, ScanTarget, mm_frame
+from shapespace.fit.scan_target import ScanTarget, crop_scan, mm_frame
 from shapespace.fit.search.initialisation import (
     Start,
     find_unit,
@@ -32,6 +32,7 @@ from shapespace.fit.search.initialisation import (
 )
 from shapespace.geometry.closest import ClosestPoints, SurfaceDistances, surface_distances
 from shapespace.geometry.doctor import repair
+from shapespace.geometry.grooming import Crop
 from shapespace.geometry.landmark_placement import landmarks_in_frame_of
 from shapespace.geometry.normals import rms_size
 from shapespace.io.interop import MeshLike, as_mesh
@@ -151,8 +152,10 @@ class FitConfig:
             the initialisation alone.
         dense: also deform the fitted surface further onto the scan, as the stage `dense` (robust method only).
         dense_settings: settings of the dense stage.
-        crop: fit only the part of the scan inside `sphere:X,Y,Z,RADIUS` or `box:X,Y,Z,X,Y,Z` (in its frame and unit),
-            or `landmarks:MM`, within this distance in mm of the landmarks; empty for the complete scan.
+        crop: fit only the part of the scan inside `sphere:X,Y,Z,RADIUS` or `box:X,Y,Z,X,Y,Z`, outside a sphere
+            (`outside:X,Y,Z,RADIUS`), or on the side of `plane:X,Y,Z,NX,NY,NZ` to which the normal N points (in its
+            frame and unit), or `landmarks:MM`, within this distance in mm of the landmarks; empty for the complete
+            scan.
         region: part of the model to which fit, distances and verdict are restricted: a name of `ShapeModel.regions`, or
             indices of vertices; None for the complete model.
         strict: reject scans with coordinates that are NaN or infinite (default: remove the triangles that use them,
@@ -434,7 +437,7 @@ def _place_scan(
     landmarks, turned = landmarks_in_frame_of(scan, landmarks or {})
     notes = list(turned)
     if config.crop:
-        scan, cropped = Crop.of(config.crop).cut(scan, full_model, landmarks, config.unit)
+        scan, cropped = crop_scan(Crop.of(config.crop), scan, full_model, landmarks, config.unit)
         notes.append(cropped)
     scan, findings = repair(scan, strict=config.strict)
     mm = MM_PER_UNIT[find_unit(model, scan) if config.unit == "auto" else config.unit]

@@ -8,9 +8,10 @@ from functools import cached_property
 
 import numpy as np
 
-from shapespace.errors import FitError, InputError
+from shapespace.errors import FitError, MeshError
 from shapespace.geometry.closest import ClosestPointEngine, ClosestPoints, VertexEngine, build_engine, finest_engine
-from shapespace.geometry.normals import boundary_vertices, part_of, rms_size
+from shapespace.geometry.grooming import Crop
+from shapespace.geometry.normals import boundary_vertices, rms_size
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, BoolArray, FloatArray, IntArray, Mesh, Similarity
 
@@ -95,99 +96,37 @@ class ScanTarget:
         return self.mesh.faces[matches.triangle], matches.barycentric
 
 
-KINDS = {"sphere": 4, "box": 6, "landmarks": 1}
-"""Number of values that each kind of crop needs."""
 _FEWEST = 30  # vertices; with fewer no fit has enough matches (`_FEWEST_MATCHES` of the robust method)
 
 
-@dataclass(frozen=True)
-class Crop:
-    """A crop of the scan: a sphere, a box, or the surroundings of its landmarks.
+def crop_scan(
+    crop: Crop, scan: Mesh, model: ShapeModel, landmarks: Mapping[str, FloatArray] | None, unit: str
+) -> tuple[Mesh, str]:
+    """Return the part of `scan` inside the crop, and a sentence on it.
 
     Args:
-        kind: a name of `KINDS`.
-        numbers: centre and radius of a sphere, or two opposite corners of a box, in the scan's own frame and unit; or
-            the largest distance from the closest landmark, mm.
+        crop: the crop.
+        scan: the scan in its own frame and unit.
+        model: shape model, whose landmarks determine the unit of the scan's landmarks.
+        landmarks: name -> (3,) of the scan.
+        unit: unit of the scan, or `auto`.
 
     Raises:
-        InputError: the numbers do not define such a crop.
+        FitError: hardly any vertex is left, or the crop needs landmarks and there are none.
     """
-
-    kind: str
-    numbers: tuple[float, ...]
-
-    def __post_init__(self) -> None:
-        finite = all(np.isfinite(number) for number in self.numbers)
-        if KINDS.get(self.kind) != len(self.numbers) or not finite:
-            raise _crop_error(self.text)
-        if self.kind != "box" and self.numbers[-1] <= 0:
-            raise InputError(f"The crop {self.text!r} needs a radius above zero.")
-
-    @property
-    def text(self) -> str:
-        """The crop in the syntax of the command line."""
-        return f"{self.kind}:{','.join(f'{number:g}' for number in self.numbers)}"
-
-    @staticmethod
-    def of(text: str) -> Crop:
-        """Return the crop that `text` specifies, such as `sphere:0,0,0,90`.
-
-        Raises:
-            InputError: the text specifies no crop.
-        """
-        kind, _, numbers = text.partition(":")
-        try:
-            return Crop(kind.strip(), tuple(float(number) for number in numbers.split(",")))
-        except ValueError as error:
-            if isinstance(error, InputError):
-                raise
-            raise _crop_error(text) from error
-
-    def cut(
-        self, scan: Mesh, model: ShapeModel, landmarks: Mapping[str, FloatArray] | None, unit: str
-    ) -> tuple[Mesh, str]:
-        """Return the part of `scan` inside the crop, and a sentence on it.
-
-        Args:
-            scan: the scan in its own frame and unit.
-            model: shape model, whose landmarks determine the unit of the scan's landmarks.
-            landmarks: name -> (3,) of the scan.
-            unit: unit of the scan, or `auto`.
-
-        Raises:
-            FitError: hardly any vertex is left, or the crop needs landmarks and there are none.
-        """
-        inside = self._inside_mask(scan, model, landmarks, unit)
-        if inside.sum() < _FEWEST:
-            low, high = (np.array2string(f(scan.vertices, axis=0), precision=4) for f in (np.nanmin, np.nanmax))
-            raise FitError(
-                f"{scan.name}: the crop {self.text} leaves {inside.sum()} of its {len(inside)} vertices, which lie "
-                f"between {low} and {high}; give a crop in the scan's own frame and unit."
-            )
-        note = f"Cropped to {inside.sum():,} of {len(inside):,} vertices ({self.text})."
-        return part_of(scan, inside), note
-
-    def _inside_mask(
-        self, scan: Mesh, model: ShapeModel, landmarks: Mapping[str, FloatArray] | None, unit: str
-    ) -> BoolArray:
-        x = scan.vertices
-        if self.kind == "box":
-            corners = np.reshape(self.numbers, (2, 3))
-            return np.asarray(((x >= corners.min(axis=0)) & (x <= corners.max(axis=0))).all(axis=1))
-        if self.kind == "sphere":
-            return np.asarray(np.linalg.norm(x - np.array(self.numbers[:3]), axis=1) <= self.numbers[3])
-        if not landmarks:
-            raise FitError(f"{scan.name}: the crop {self.text} needs landmarks, and none are given for it.")
-        points = np.stack(list(landmarks.values()))
+    if crop.kind != "landmarks":
+        inside = crop.contains(scan.vertices)
+    elif landmarks:
         mm = MM_PER_UNIT[unit if unit != "auto" else _find_landmark_unit(model, landmarks, scan.name)]
-        inside = np.zeros(len(x), dtype=np.bool_)
-        for point in points:
-            inside |= np.linalg.norm(x - point, axis=1) * mm <= self.numbers[0]
-        return inside
-
-
-def _crop_error(text: str) -> InputError:
-    return InputError(f"There is no crop {text!r}; give sphere:X,Y,Z,R or box:X,Y,Z,X,Y,Z or landmarks:MM.")
+        inside = np.zeros(len(scan.vertices), dtype=np.bool_)
+        for point in np.stack(list(landmarks.values())):
+            inside |= np.linalg.norm(scan.vertices - point, axis=1) * mm <= crop.numbers[0]
+    else:
+        raise FitError(f"{scan.name}: the crop {crop.text} needs landmarks, and none are given for it.")
+    try:
+        return crop.cut(scan, inside, _FEWEST)
+    except MeshError as error:
+        raise FitError(str(error)) from error
 
 
 def _find_landmark_unit(model: ShapeModel, landmarks: Mapping[str, FloatArray], scan_name: str) -> str:

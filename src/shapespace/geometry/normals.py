@@ -45,6 +45,20 @@ def part_of(mesh: Mesh, keep: BoolArray) -> Mesh:
     return replace(mesh, vertices=vertices, faces=faces, colours=colours, observed=observed, position_std=std)
 
 
+def with_triangles(mesh: Mesh, keep: BoolArray, cause: str) -> Mesh:
+    """Return `mesh` with its triangles `keep` (F,) and the vertices that they use.
+
+    Raises:
+        MeshError: no triangle is kept; the message names the `cause`.
+    """
+    faces = faces_of(mesh)[keep]
+    if not len(faces):
+        raise MeshError(f"{mesh.name}: {cause} leaves no triangle; give a scan with a larger part of the surface.")
+    used, numbered = np.unique(faces, return_inverse=True)
+    kept = part_of(mesh, np.isin(np.arange(len(mesh.vertices)), used))
+    return replace(kept, faces=numbered.reshape(-1, 3).astype(np.int32))
+
+
 def without_estimates(mesh: Mesh) -> Mesh:
     """Return `mesh` with not-a-number at the vertices that are not observed, and without a mask."""
     if mesh.observed is None:

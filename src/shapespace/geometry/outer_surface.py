@@ -6,14 +6,12 @@ The criterion is therefore the exposure of a triangle: the share of all directio
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from shapespace.compiled import compiled
-from shapespace.geometry.normals import face_vectors, faces_of, part_of
+from shapespace.geometry.normals import face_vectors, faces_of, with_triangles
 from shapespace.geometry.remesh import LongArray
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
 
@@ -37,9 +35,7 @@ def outer_surface(mesh: Mesh) -> Mesh:
     is_outer = _without_specks(mesh, _exposure(mesh, _AXES, _PIXELS) >= _EXPOSED)
     if is_outer.all():
         return mesh
-    used, faces = np.unique(mesh.faces[is_outer], return_inverse=True)
-    faces = faces.reshape(-1, 3).astype(np.int32)
-    return replace(part_of(mesh, np.isin(np.arange(len(mesh.vertices)), used)), faces=faces)
+    return with_triangles(mesh, is_outer, "the outer surface")
 
 
 def hidden_share(mesh: Mesh) -> float:

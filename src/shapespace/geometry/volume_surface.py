@@ -9,7 +9,8 @@ by more than half a voxel (after R. T. Whitaker, "Reducing Aliasing Artifacts in
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Sequence
+from collections import Counter
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial, reduce
 from itertools import pairwise
@@ -208,24 +209,92 @@ def labels_in(labels: _Labels) -> tuple[int, ...]:
     Raises:
         InputError: there are more labels than in a segmentation.
     """
-    numbers: set[int] = set()
+    return tuple(count_voxels(labels))
+
+
+def count_voxels(labels: _Labels) -> dict[int, int]:
+    """Return the number of voxels of each label in (X, Y, Z) other than 0, in ascending order of the labels.
+
+    Raises:
+        InputError: there are more labels than in a segmentation.
+    """
+    numbers = Counter[int]()
     for block in _blocks(labels.shape):
         values = labels[block]
         if values.any():
             low, high = int(values.min()), int(values.max())
             if high - low < 2:
-                numbers.update((low, high))
+                above = int(np.count_nonzero(values == high))
+                numbers.update({high: above} if low == high else {low: values.size - above, high: above})
             elif high - low < _MOST_LABELS:
                 # Subtraction in uint64 wraps around, so that it is correct for negative labels too.
-                above = (values.astype(np.uint64) - np.uint64(low % 2**64)).astype(np.intp)
-                numbers.update(low + int(value) for value in np.flatnonzero(np.bincount(above.ravel())))
+                counts = np.bincount((values.astype(np.uint64) - np.uint64(low % 2**64)).astype(np.intp).ravel())
+                numbers.update({low + int(k): int(counts[k]) for k in np.flatnonzero(counts)})
             else:
-                numbers.update(np.unique(values).tolist())
+                found, times = np.unique(values, return_counts=True)
+                numbers.update(dict(zip(found.tolist(), times.tolist(), strict=True)))
         if len(numbers) > _MOST_LABELS:
             raise InputError(
                 f"It has more than {_MOST_LABELS:,} labels, so it is an image, not a segmentation; give the label map."
             )
-    return tuple(sorted(numbers - {0}))
+    return {label: numbers[label] for label in sorted(numbers) if label}
+
+
+@dataclass(frozen=True)
+class LabelCount:
+    """A label or a segment of a volume.
+
+    Args:
+        choice: text that chooses it as the object, such as with `shapespace surface --label`.
+        name: name of the segment, or the label.
+        voxels: number of its voxels.
+    """
+
+    choice: str
+    name: str
+    voxels: int
+
+
+def count_labels(volume: LabelVolume) -> tuple[LabelCount, ...]:
+    """Return the labels and segments of a volume with their numbers of voxels.
+
+    Raises:
+        InputError: there is no label, or the values are grey values of an image.
+    """
+    segments = {(item.layer, item.label): item for item in volume.segments}
+    often = Counter(item.name for item in volume.segments)
+    counts: list[LabelCount] = []
+    for layer, labels in enumerate(volume.layers):
+        try:
+            voxels = count_voxels(labels)
+        except InputError as error:
+            raise InputError(f"{volume.name}: {error}") from error
+        if _is_image(labels, voxels):
+            raise InputError(
+                f"{volume.name}: most neighbouring voxels differ, with {len(voxels):,} values in all, as in a CT or MR "
+                "image; give its segmentation (label map)."
+            )
+        for label, count in voxels.items():
+            segment = segments.get((layer, label))
+            if segment is None:
+                counts.append(LabelCount(str(label), str(label), count))
+                continue
+            is_clear = often[segment.name] == 1 and "," not in segment.name  # a comma separates labels
+            counts.append(LabelCount(segment.name if is_clear else segment.id, segment.name, count))
+    if not counts:
+        raise InputError(f"{volume.name}: all its voxels are 0; give a volume with a label.")
+    return tuple(counts)
+
+
+def _is_image(labels: _Labels, voxels: Mapping[int, int]) -> bool:
+    """Return whether most neighbours have different values, apart from 0 and the most frequent one: the background."""
+    common = max(voxels, key=voxels.__getitem__, default=0)
+    equal = pairs = 0
+    for first, second in pairwise(labels):
+        inside = (first != 0) & (second != 0) & ((first != common) | (second != common))
+        pairs += int(inside.sum())
+        equal += int((inside & (first == second)).sum())
+    return 2 * equal < pairs
 
 
 _Places = dict[int, list[int]]

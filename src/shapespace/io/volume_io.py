@@ -28,6 +28,7 @@ import numpy.typing as npt
 
 from shapespace.errors import FileError, InputError, ShapespaceError
 from shapespace.io.files import open_file, read_error
+from shapespace.io.memory_cache import available_bytes
 from shapespace.io.parsing import CUT_SHORT, damage_error
 from shapespace.types import MAX_MEMORY_BYTES, FloatArray, LabelVolume, Segment
 
@@ -39,6 +40,7 @@ _MOST_HEADER = 1 << 20  # 1 MiB
 _PIECE = 1 << 20  # bytes (1 MiB)
 _WORK_BYTES = 1 << 26
 """Memory for reading in addition to the labels: libraries, and pieces of 1 MiB as float64 (64 MiB; measured: 40)."""
+_MOST_OF_MEMORY = 0.8  # share of the free memory; the rest is for other processes
 # A deflate stream expands by a factor of at most 1032.
 _DEFLATE_GROWTH = 1032
 _BZIP2_SPARE, _BZIP2_GROWTH = 1 << 28, 10_000
@@ -122,6 +124,12 @@ def require_volumes_extra() -> None:
         raise ShapespaceError(
             f"Volumes need {' and '.join(missing)}, which is not installed; run pip install 'shapespace[volumes]'."
         )
+
+
+def default_limit_bytes() -> int:
+    """Return the memory limit of one volume: `MAX_MEMORY_BYTES`, or 80 % of the free memory if that is less."""
+    free = available_bytes()
+    return MAX_MEMORY_BYTES if free is None else min(MAX_MEMORY_BYTES, int(_MOST_OF_MEMORY * free))
 
 
 def volume_name(path: Path) -> str:

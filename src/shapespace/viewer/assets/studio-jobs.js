@@ -82,7 +82,7 @@
   }
 
   /** The form of a command with its checks and its button. */
-  function JobForm({ kind, sources = [], defaults, strong, checked, disabled, label, children }) {
+  function JobForm({ kind, sources = [], defaults, strong, checked = kind === "correspond", disabled, label, children }) {
     const form = Studio.forms[kind];
     const initial = useMemo(() => Object.fromEntries((form ? form.options : []).map((option) => [option.flag, option.initial === null ? "" : option.initial])), [form]);
     // The settings open as the last run had them.
@@ -91,7 +91,7 @@
     const [checks, setChecks] = useState(null);
     const [checkedFor, setCheckedFor] = useState(null); // settings of these checks; a problem of earlier ones does not keep a run back
     const [starting, setStarting] = useState(false);
-    const { columns, jobs, revision } = Studio.state.project;
+    const { columns, jobs, revision, odd } = Studio.state.project;
     const options = form ? changedOptions(form, values) : {};
     const asked = JSON.stringify([options, on]);
     useEffect(() => {
@@ -125,6 +125,7 @@
         ${form.options.filter((option) => option.visible).map(show)}
         ${folded.length > 0 && html`<details data-testid="more-options"><summary>${J.more(folded.length)}</summary>${folded.map(show)}</details>`}
         ${children}
+        ${kind === "correspond" && odd.length > 0 && html`<p class="odd"><a href="#specimens" data-testid="odd-link">${T.specimens.odd.link(odd.length)}</a></p>`}
         <button class=${strong ? "strong wide" : "wide"} data-testid=${`run-${kind}`} disabled=${disabled || starting || missing || problem}>${word}</button>
         ${/* Below the button, which they must not move while it is pressed. */ checked && html`<div class="checks" role="status" aria-label=${T.questions.checks} data-testid="checks">
           ${checks === null ? html`<p class="hint">${T.questions.checking}</p>` : checks.map((check) => html`<p class=${check.level}><b>${T.questions.levels[check.level]}</b> ${check.text}</p>`)}</div>`}
@@ -249,9 +250,9 @@
   /** Jobs that other screens show: those that run or wait, and the newest one of a kind if it failed. */
   const Elsewhere = ({ kinds }) => {
     const newest = new Map(Studio.state.project.jobs.map((job) => [job.kind, job]));
-    const shown = Studio.state.project.jobs.filter((job) => !kinds.includes(job.kind) && (Studio.isActive(job) || (job.status === "failed" && newest.get(job.kind) === job)));
+    const shown = Studio.state.project.jobs.filter((job) => !kinds.includes(job.kind) && (Studio.isActive(job) || ((job.status === "failed" || job.partly) && newest.get(job.kind) === job)));
     return shown.length > 0 && html`<div class="elsewhere" data-testid="elsewhere">${shown.map((job) => html`<p key=${job.number} class=${job.status} data-testid=${`elsewhere-${job.number}`}>
-      <strong>${kindOf(job)}</strong> <span class="hint">${J.statuses[job.status]}${job.progress ? `, ${J.progress(job.progress)}` : job.status === "failed" ? `: ${job.message}` : ""}</span>
+      <strong>${kindOf(job)}</strong> <span class="hint">${J.statuses[job.status]}${job.progress ? `, ${J.progress(job.progress)}` : job.status === "failed" || job.partly ? `: ${job.message}` : ""}</span>
       ${Studio.isActive(job) && html`<${Button} edits small testid=${`elsewhere-cancel-${job.number}`} onclick=${() => Studio.act(`/api/jobs/${job.number}/cancel`)}>${J.cancel}<//>`}</p>`)}</div>`;
   };
 

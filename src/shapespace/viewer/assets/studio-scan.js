@@ -215,6 +215,7 @@
           <span class="grow"></span><${Button} small testid="scan-close" onclick=${onclose}>${window.ShapespaceTexts.close}<//></div>
         <div class="scan-body"><div class="scan-view"><div ref=${box} class="canvas" data-testid="scan-view" data-ready=${state === ""}></div><p class="hint" role="status">${state}</p><span ref=${bar} class="scale-bar" data-testid="scan-scale"></span></div>
           ${state === "" && html`<${Landmarks} specimen=${specimen} view=${view.current} box=${box.current} mirrored=${mirrored} />`}</div>
+        <${Studio.Groom} specimen=${specimen} view=${view} ready=${state === ""} />
         <p class="hint">${S.scan.axes}${borders ? ` ${S.scan.borders}` : ""}</p>
         <${Studio.Findings} specimen=${specimen} />
       <//>`;

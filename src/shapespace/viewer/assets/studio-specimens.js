@@ -9,6 +9,7 @@
   const S = T.specimens;
   const { Button, Confirm, FileButton, DropZone, UploadStatus, FolderBrowser } = Studio;
   const SHOWN = 200; // specimens drawn at first, and by each "Show more"
+  const FEW = 3; // findings that are not folded
 
   const include = (specimen, box) => Studio.editBy({ what: "include", ids: [specimen.id], included: box.checked }, () => { box.checked = specimen.included; });
 
@@ -23,7 +24,7 @@
     const [open, setOpen] = useState(false);
     if (specimen.state === "waiting") return null;
     return html`<${Button} small class="quiet show-scan" aria-label=${S.scan.show(specimen.id)} testid=${`show-${specimen.id}`} onclick=${() => setOpen(true)}>${S.scan.open}<//>
-      ${open && html`<${Studio.Scan} specimen=${specimen} onclose=${() => setOpen(false)} />`}`;
+      ${open && html`<${Studio.Scan} key=${specimen.file} specimen=${specimen} onclose=${() => setOpen(false)} />`}`;
   };
 
   /** A select of units; the first one leaves scans as they are. */
@@ -50,6 +51,7 @@
   }
 
   function Card({ specimen, groups, names, selected, onselect }) {
+    const tags = [specimen.set === "new" && S.new, specimen.mirrored && S.mirrored, specimen.groomed && S.groom.done, specimen.unit && S.unit(specimen.unit)].filter(Boolean);
     return useMemo(() => html`
       <li class=${`card ${specimen.included ? "" : "excluded"}`} data-testid=${`card-${specimen.id}`} data-state=${specimen.state}>
         <button type="button" class="picture" aria-pressed=${selected} data-testid=${`select-${specimen.id}`} onclick=${(event) => onselect(specimen.id, event)}>
@@ -58,16 +60,28 @@
             ? html`<img class=${specimen.mirrored ? "mirrored" : ""} src=${`/api/thumbnails/${encodeURIComponent(specimen.id)}`} alt="" loading="lazy" />`
             : html`<span>${S.states[specimen.state]}</span>`}
         </button>
-        <div class="row"><${Studio.Include} specimen=${specimen} /><strong title=${specimen.id}>${specimen.id}</strong><${Studio.ShowScan} specimen=${specimen} />${specimen.set === "new" && html`<span class="tag">${S.new}</span>`}
-          ${specimen.mirrored && html`<span class="tag">${S.mirrored}</span>`}${specimen.unit && html`<span class="tag">${S.unit(specimen.unit)}</span>`}</div>
+        <div class="row"><${Studio.Include} specimen=${specimen} /><strong title=${specimen.id}>${specimen.id}</strong><${Studio.ShowScan} specimen=${specimen} /></div>
+        ${tags.length > 0 && html`<div class="row">${tags.map((tag) => html`<span class="tag">${tag}</span>`)}</div>`}
         ${groups !== "[]" && html`<div class="row">${JSON.parse(groups).map(([column, name, colour]) => html`<span class="tag group" title=${`${column}: ${name}`}>${colour && html`<i style=${{ background: colour }}></i>`}${name}</span>`)}</div>`}
         ${Studio.placed(specimen) > 0 && html`<p class="finding" data-testid=${`placed-${specimen.id}`}>${S.marks.placed(Studio.placed(specimen), names.length)}</p>`}
         <${Studio.Findings} specimen=${specimen} />
       </li>`, [specimen, groups, names, selected, onselect]);
   }
 
+  /** Specimens that differ from the others, each with its view and a unit in which it would not. */
+  const Odd = ({ project }) => {
+    const line = ({ id, text, unit }) => html`<p key=${id} data-testid=${`odd-${id}`}><strong>${id}</strong>: ${text}
+      ${unit && html` <${Button} edits small testid=${`odd-unit-${id}`} onclick=${() => Studio.edit({ what: "unit", ids: [id], unit })}>${S.odd.setUnit(S.unit(unit))}<//>`}
+      <${Studio.ShowScan} specimen=${project.specimens.find((one) => one.id === id)} /></p>`;
+    return project.odd.length > 0 && html`
+      <section class="notes" aria-label=${S.odd.title} data-testid="odd"><h3>${S.odd.title}</h3>${project.odd.slice(0, FEW).map(line)}
+        ${project.odd.length > FEW && html`<details><summary>${S.odd.more(project.odd.length - FEW)}</summary>${project.odd.slice(FEW, SHOWN).map(line)}</details>`}
+      </section>`;
+  };
+
   /** Notes on the table, and the number of specimens of each class. */
   const About = ({ project }) => html`
+    <${Odd} project=${project} />
     ${project.notes.length > 0 && html`<section class="notes" aria-label=${S.notes} data-testid="notes"><h3>${S.notes}</h3>${project.notes.map((note) => html`<p>${note}</p>`)}</section>`}
     ${Object.keys(project.counts).length > 0 && html`
       <section aria-label=${S.classes} class="counts" data-testid="counts">
@@ -140,6 +154,7 @@
   Studio.SelectionBar = function SelectionBar({ selected, onclear }) {
     const [removing, setRemoving] = useState(false);
     const [grouping, setGrouping] = useState(false);
+    const [grooming, setGrooming] = useState(false);
     if (Studio.state.read_only) return null;
     const ids = selected.map((one) => one.id);
     const toNew = selected.some((one) => one.set === "training"), mirrored = selected.some((one) => !one.mirrored);
@@ -152,11 +167,13 @@
         <${Button} small testid="set-selected" onclick=${() => Studio.edit({ what: "set", ids, set: toNew ? "new" : "training" })}>${toNew ? S.toNew : S.toTraining}<//>
         <${Button} small testid="group-selected" disabled=${grouping} onclick=${() => setGrouping(true)}>${S.group}<//>
         <${Button} small testid="mirror-selected" onclick=${() => Studio.edit({ what: "mirror", ids, mirrored })}>${mirrored ? S.mirror : S.unmirror}<//>
+        <${Button} small testid="groom-selected" disabled=${grooming} onclick=${() => setGrooming(true)}>${S.groom.open}<//>
         <label>${S.columns.unit} <${Studio.Unit} aria-label=${S.setUnit} data-testid="unit-selected" value=${selected.every((one) => one.unit === selected[0].unit) ? selected[0].unit : ""}
           onunit=${(select) => Studio.edit({ what: "unit", ids, unit: select.value })} /></label>
         <${Button} small testid="remove-selected" onclick=${() => setRemoving(true)}>${S.remove}<//>
         <${Button} small testid="clear-selection" onclick=${onclear}>${S.clear}<//>
         ${/* Last, on a line of its own: where it stood between the buttons, a click that met its closing went to another of them. */ grouping && html`<${Group} ids=${ids} onclose=${() => setGrouping(false)} />`}
+        ${grooming && html`<${Studio.GroomForm} specimens=${selected} onclose=${() => setGrooming(false)} />`}
         ${removing && html`<${Confirm} title=${S.removeTitle(ids.length)} text=${S.removeText} action=${S.remove} onclose=${() => setRemoving(false)}
           onyes=${async () => { if (await Studio.edit({ what: "remove", ids })) onclear(); }} />`}
       </div>`;

@@ -12,6 +12,7 @@
   const Studio = (window.ShapespaceStudio = {
     state: null, // of /api/project
     forms: {}, // of /api/forms
+    volumes: [], // uploaded label volumes whose labels are not chosen yet: {file, name, set}
     uploads: { total: 0, done: 0, added: 0, notes: [] },
     changed: () => {}, // draws the page
   });
@@ -167,10 +168,11 @@
   function upload(files, set, only) {
     if (!uploading()) Studio.uploads = { total: 0, done: 0, added: 0, notes: [] };
     files.sort((a, b) => byName(a.name, b.name));
-    const { formats, landmark_formats: ofLandmarks } = Studio.state;
-    const kindOf = ({ name }) => only || (ending(name, TABLES) ? "table" : !ending(name, formats) && ending(name, ofLandmarks) ? "landmarks" : "");
+    const { formats, landmark_formats: ofLandmarks, volume_formats: ofVolumes } = Studio.state;
+    const kindOf = ({ name }) => only || (ending(name, TABLES) ? "table" : ending(name, ofVolumes) ? "volume" : !ending(name, formats) && ending(name, ofLandmarks) ? "landmarks" : "");
+    const comesLater = (kind) => kind === "table" || kind === "landmarks"; // as their rows name the scans
     const all = files.map((file) => [file, set, kindOf(file)]);
-    waiting.push(...all.filter(([, , kind]) => !kind), ...all.filter(([, , kind]) => kind));
+    waiting.push(...all.filter(([, , kind]) => !comesLater(kind)), ...all.filter(([, , kind]) => comesLater(kind)));
     Studio.uploads.total += files.length;
     Studio.changed();
     for (let k = workers; k < UPLOADS_AT_ONCE && waiting.length; k++) work();
@@ -178,10 +180,11 @@
 
   async function work() {
     workers += 1;
-    while (waiting.length && !(waiting[0][2] && workers > 1)) {
+    while (waiting.length && !(["table", "landmarks"].includes(waiting[0][2]) && workers > 1)) {
       const [file, set, kind] = waiting.shift();
       try {
-        if (kind) await importTable(file, kind);
+        if (kind === "volume") await uploadVolume(file, set);
+        else if (kind) await importTable(file, kind);
         else await uploadScan(file, set);
       } catch (error) {
         Studio.uploads.notes.push(error.message.includes(file.name) ? error.message : `${file.name}: ${error.message}`);
@@ -195,10 +198,22 @@
     Studio.changed();
   }
 
+  function checkSize(file, tooLarge) {
+    const most = Studio.state.upload_bytes;
+    if (file.size > most) throw new Error(tooLarge(file.name, Math.round(most / 2 ** 20)));
+  }
+
+  /** Add a label volume; its labels are asked for when all files of the drop are there. */
+  async function uploadVolume(file, set) {
+    checkSize(file, T.uploads.volumeTooLarge);
+    const { file: stored } = await json(`/api/volumes?name=${encodeURIComponent(file.name)}`, { method: "PUT", body: file });
+    Studio.volumes.push({ file: stored, name: file.name, set });
+    Studio.volumes.sort((a, b) => byName(a.name, b.name));
+  }
+
   async function uploadScan(file, set) {
-    const { formats, upload_bytes: most } = Studio.state;
-    if (!ending(file.name, formats)) throw new Error(T.uploads.format(file.name));
-    if (file.size > most) throw new Error(T.uploads.tooLarge(file.name, Math.round(most / 2 ** 20)));
+    if (!ending(file.name, Studio.state.formats)) throw new Error(T.uploads.format(file.name));
+    checkSize(file, T.uploads.tooLarge);
     const answer = await json(`/api/specimens?name=${encodeURIComponent(file.name)}&set=${set}`, { method: "PUT", body: file });
     if (answer.same_as) Studio.uploads.notes.push(T.uploads.same(file.name, answer.same_as));
     else Studio.uploads.added += 1;

@@ -69,7 +69,7 @@
       set(null);
       onblock(rows);
     };
-    return html`<td><input class="entry" size="8" aria-label=${label} data-testid=${testid} data-row=${row} data-column=${column} value=${draft === null ? value : draft} title=${value} readonly=${Studio.state.read_only}
+    return html`<td class=${column ? "" : "name"}><input class="entry" size="8" style=${{ minWidth: `var(--width-${column})` }} aria-label=${label} data-testid=${testid} data-row=${row} data-column=${column} value=${draft === null ? value : draft} title=${value} readonly=${Studio.state.read_only}
       data-edited=${draft !== null} oninput=${(event) => set(event.target.value)} onblur=${send} onkeydown=${key} onpaste=${paste} /></td>`;
   }
 
@@ -130,6 +130,12 @@
       <//>`;
   }
 
+  /** Widths of the columns that are edited, after the longest of their texts. */
+  function widths(listed, columns) {
+    const longest = [["", 12, 40], ...columns.map((name) => [name, 6, 22])].map(([name, least, most]) => Math.min(most, Math.max(least, ...listed.map((one) => (name ? one.cells[name] || "" : one.id).length))));
+    return Object.fromEntries(longest.map((letters, k) => [`--width-${k}`, `${letters + 2}ch`]));
+  }
+
   /** A table of `listed`; pasted blocks go on to specimens that are not shown yet. */
   Studio.Table = function Table({ listed, shown, columns, selection, onselect, onselectall }) {
     const { point_names: names } = Studio.state.project;
@@ -147,11 +153,11 @@
     return html`
       ${!Studio.state.read_only && html`<p class="hint">${S.pasteHint}</p>`}
       <div class="table-box" role="region" aria-label=${S.tableLabel} tabindex="0">
-        <table data-testid="table">
+        <table data-testid="table" style=${widths(listed, columns)}>
           <caption class="hidden">${S.tableLabel}</caption>
           <thead><tr>
             <th scope="col"><input type="checkbox" checked=${all} aria-label=${S.selectAll} data-testid="select-all" onclick=${onselectall} /></th>
-            <th scope="col">${S.columns.use}</th><th scope="col">${S.columns.id}</th>
+            <th scope="col">${S.columns.use}</th><th scope="col" class="name">${S.columns.id}</th>
             ${columns.map((name) => html`<th scope="col" key=${name}><span class="head">${name}
               <${Button} edits small class="quiet" aria-label=${S.removeColumn(name)} testid=${`remove-column-${name}`} onclick=${() => setRemoving(name)}>×<//></span></th>`)}
             <th scope="col">${S.columns.set}</th><th scope="col">${S.columns.unit}</th><th scope="col">${S.columns.mirror}</th>

@@ -31,7 +31,7 @@
     },
 
     specimens: {
-      dropTitle: "Drop scans or folders here", dropHint: (formats) => `Mesh and point cloud files (${formats}), a table (CSV or XLSX) with their data, and files of landmarks.`,
+      dropTitle: "Drop scans or folders here", dropHint: (formats) => `Mesh and point cloud files (${formats}), label volumes (NIfTI, NRRD), a table (CSV or XLSX) with their data, and files of landmarks.`,
       chooseFiles: "Choose files", chooseFolder: "Choose a folder", addHere: "Add from this machine", importTable: "Import a table", importLandmarks: "Import landmarks",
       addTitle: "Add scans from this machine", byReference: "Refer to the files where they are", byCopy: "Copy the files into the project",
       addFolder: "Add this folder", added: (number) => `${count(number, "scan")} added.`,
@@ -61,6 +61,20 @@
         remove: "Remove from this scan", removeOf: (name) => `Remove ${name} from this scan`, removeAll: (name) => `Remove the landmark ${name} from all scans`, specimens: "Specimens",
         intro: "Correspondence, and fits by a model with the same landmarks, use the landmarks of scans. An export has them in the unit and axes of each scan.", download: "Download",
       },
+      odd: { title: "These specimens differ from the others", setUnit: (unit) => `Set its unit to ${unit}`, link: (number) => `${count(number, "specimen differs", "specimens differ")} from the others: look at ${number === 1 ? "it" : "them"} first`, more: (number) => `${count(number, "more specimen")}` },
+      groom: {
+        open: "Groom", done: "groomed", title: "Groom", largest: "Keep the largest piece", outer: "Remove inner surfaces", holes: "Fill holes with border edges up to",
+        hint: "The part that remains keeps its coordinates and its unit. The file of the scan stays as it is.", apply: "Groom", original: "Use the original scan", running: "Being groomed",
+        sphere: "Crop by a sphere", plane: "Crop by a plane", radius: "Radius", keep: "Keep", sides: { inside: "the part inside", outside: "the part outside", behind: "the part behind it", front: "the part in front of it" },
+        click: { sphere: "Click the centre of the sphere on the scan.", plane: "Turn the scan, then click a point on it: the plane passes through this point and faces you." },
+        keeps: (percent) => `${percent} % of the points that are drawn remain.`, clear: "No crop",
+      },
+      volumes: {
+        title: (number) => `Surfaces of ${count(number, "label volume")}`, reading: (done, total) => `Reading the labels of volume ${done} of ${total}`, which: "Labels that form the object",
+        label: (name, voxels, number, total) => `${name}: ${voxels.toLocaleString("en")} voxels${number < total ? `, in ${number} of ${total} volumes` : ""}`,
+        together: "Several labels become one object.", lacks: (name) => `${name} lacks a chosen label; it becomes no specimen.`, make: "Make surfaces",
+        specimens: (number) => `${count(number, "surface")} will be added as ${number === 1 ? "a specimen" : "specimens"}, in mm.`,
+      },
       paste: {
         title: (number) => `Paste the cells of ${count(number, "specimen")}?`, action: "Paste",
         byName: "Each row goes to the specimen that it names.",
@@ -75,7 +89,7 @@
     },
     uploads: {
       progress: (done, total) => `Adding file ${Math.min(done + 1, total)} of ${total}`, finished: (added) => `${count(added, "file")} added.`,
-      leftOut: (number) => `${count(number, "file")} not added`, tooLarge: (name, limit) => `${name} is larger than ${limit} MB; add it from this machine instead.`,
+      leftOut: (number) => `${count(number, "file")} not added`, tooLarge: (name, limit) => `${name} is larger than ${limit} MB; add it from this machine instead.`, volumeTooLarge: (name, limit) => `${name} is larger than ${limit} MB; crop it to the object, for example in 3D Slicer.`,
       format: (name) => `${name} is not a scan in a format that can be read.`, same: (name, other) => `${name} has the same content as ${other}.`,
       landmarks: (name, number, matched) => `${name}: ${count(number, "landmark")} of ${count(matched, "specimen")} read.`,
       table: (name, matched) => `${name}: cells of ${count(matched, "specimen")} read.`, dismiss: "Close the list",

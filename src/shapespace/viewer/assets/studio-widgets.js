@@ -66,6 +66,7 @@
         ${Studio.uploading() && html`<progress class="upload-bar" max=${total} value=${done} aria-label=${T.uploads.progress(done, total)}></progress>`}
         ${notes.length > 0 && html`<details open=${notes.length <= 3}><summary>${T.count(notes.length, "note")}</summary>
           <ul data-testid="upload-notes">${notes.slice(0, 200).map((note) => html`<li>${note}</li>`)}</ul></details>`}
+        ${!Studio.uploading() && Studio.volumes.length > 0 && html`<${Studio.VolumeLabels} volumes=${Studio.volumes} />`}
         ${!Studio.uploading() && html`<${Button} small testid="uploads-close" onclick=${() => { Studio.uploads = { total: 0, done: 0, added: 0, notes: [] }; Studio.changed(); }}>${T.close}<//>`}
       </div>`;
   }

@@ -12,6 +12,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
 from msgspec import to_builtins
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
@@ -21,11 +22,13 @@ from starlette.routing import Mount, Route
 from starlette.types import ASGIApp
 
 from shapespace.batch.result_folder import LOCK, only_writer
+from shapespace.correspondence.odd_scans import OddScan, ScanMeasures, find_odd_scans
 from shapespace.errors import FileError, InputError
 from shapespace.io.containers.json_files import plain_json
 from shapespace.io.files import atomic_path
 from shapespace.io.landmarks.configuration_io import CONFIGURATION_ENDINGS
 from shapespace.io.meshes.mesh_io import MESH_ENDINGS, MESH_FILE_ENDINGS
+from shapespace.io.volume_io import VOLUME_ENDINGS
 from shapespace.schemas import read
 from shapespace.types import MM_PER_UNIT
 from shapespace.version import __version__
@@ -48,9 +51,11 @@ from shapespace.viewer.studio.job_commands import (
     OptionLabels,
     Outdated,
     checks,
+    groomed_scans,
     order,
     outdated_results,
     shapes_of,
+    stored_volumes,
 )
 from shapespace.viewer.studio.jobs import Job, Jobs, Order, history
 from shapespace.viewer.studio.landmark_import import is_landmark_table, points_of_file
@@ -68,6 +73,7 @@ from shapespace.viewer.studio.project import (
 from shapespace.viewer.studio.specimen_checks import SpecimenChecks
 from shapespace.viewer.studio.views import Views, result_path, view_kinds
 
+_VOLUME_ENDINGS = tuple(ending for ending in VOLUME_ENDINGS if ending != ".mhd")  # whose data are in another file
 _TABLE_BYTES, _REQUEST_BYTES = 2**24, 2**20
 _EVENT_S = 0.4  # between events
 _MOST_LISTED = 2000  # folders and files of a listing
@@ -93,12 +99,14 @@ class OpenProject:
         self._resources = ExitStack()
         if not read_only:
             self._resources.enter_context(only_writer(self.project.folder))
-        self.jobs = Jobs(self.project.folder, changed, read_only=read_only)
+        takers = {"surface": self._take_surfaces, "groom": self._take_groomed}
+        self.jobs = Jobs(self.project.folder, changed, takers, read_only=read_only)
         self.checks = SpecimenChecks(self.project.folder, changed, self.project.exclude, read_only=read_only)
         self.views = Views(self._result, labels)
         self._sentence = labels.sentence
         self._forms = forms
         self._outdated: tuple[object, dict[int, Outdated]] = (None, {})
+        self._odd: tuple[object, dict[str, OddScan]] = (None, {})
         for resource in (self.views, self.checks, self.jobs):
             self._resources.callback(resource.close)
 
@@ -106,14 +114,36 @@ class OpenProject:
         """Close the project; a running job continues."""
         self._resources.close()
 
+    def _take_surfaces(self, job: Job) -> list[str]:
+        return self.project.add_surfaces(self.project.folder / job.output, _role(job.options.get("set")))
+
+    def _take_groomed(self, job: Job) -> list[str]:
+        self.project.take_groomed(groomed_scans(job, self.project.folder))
+        return []
+
     def _result(self, number: int) -> Path | None:
         """Return the path of the result of a job; None if it has none."""
         job = next((job for job in self.jobs.all() if job.number == number and job.status == "done"), None)
         return None if job is None else result_path(self.project.folder, job.output)
 
+    def odd_scans(self) -> dict[str, OddScan]:
+        """Return the included specimens that differ from the others in size or shape, by their ids."""
+        included = [specimen for specimen in self.project.state.specimens if specimen.included]
+        facts = [self.checks.facts(self.project.path(specimen)) or {} for specimen in included]
+        key = [
+            (specimen.id, specimen.unit or "mm", fact["size"], fact["profile"])
+            for specimen, fact in zip(included, facts, strict=True) if "profile" in fact
+        ]  # fmt: skip
+        if key != self._odd[0]:
+            measures = [ScanMeasures(size, np.array(profile)) for _, _, size, profile in key]
+            found = find_odd_scans(measures, [unit for _, unit, _, _ in key])
+            self._odd = key, {key[k][0]: odd for k, odd in found.items()}
+        return self._odd[1]
+
     def facts(self) -> dict[str, Any]:
         """Return the state for the page."""
-        project, state, jobs = self.project, self.project.state, self.jobs.all()
+        jobs, project = self.jobs.all(), self.project  # in this order: a job that is done has changed the state
+        state = project.state
         key = (state, [(job.number, job.status) for job in jobs])
         if key != self._outdated[0]:
             self._outdated = key, outdated_results(project, jobs, self._forms)
@@ -124,13 +154,16 @@ class OpenProject:
             }  # fmt: skip
             specimens.append({
                 "id": specimen.id, "file": specimen.file, "set": specimen.role, "included": specimen.included,
-                "unit": specimen.unit, "mirrored": specimen.mirrored, "cells": specimen.cells,
-                "points": specimen.points, **facts,
+                "unit": specimen.unit, "mirrored": specimen.mirrored, "groomed": bool(specimen.original),
+                "cells": specimen.cells, "points": specimen.points,
+                **{key: fact for key, fact in facts.items() if key != "profile"},
                 "findings": [{**finding, "text": self._sentence(finding["text"])} for finding in facts["findings"]],
             })  # fmt: skip
         return {
             "name": state.name, "folder": str(project.folder), "revision": project.revision,
-            "columns": list(state.columns), "specimens": specimens, "notes": state.notes(), "counts": state.counts(),
+            "columns": list(state.columns), "specimens": specimens,
+            "odd": [{"id": name, "text": odd.text, "unit": odd.unit} for name, odd in self.odd_scans().items()],
+            "notes": state.notes(), "counts": state.counts(),
             "undo": project.undo_text, "redo": project.redo_text, "landmarks": state.landmarks,
             "landmarks_on": state.landmarks_on, "point_names": list(state.point_names),
             "jobs": [self._job(job) for job in jobs],
@@ -142,13 +175,15 @@ class OpenProject:
         path = self._result(job.number)
         kinds = [] if path is None else view_kinds(path)
         sentences, methods = ([], None) if path is None else _words(path)
+        problems = self.jobs.problems(job) if job.kind in ("surface", "groom") and job.status == "done" else ""
         return {
             "number": job.number, "kind": job.kind, "command": job.command, "status": job.status,
-            "message": self._sentence(job.message), "progress": progress, "seconds": self.jobs.running_for(job),
-            "left_s": left_s, "output": job.output, "options": job.options, "on": job.on,
+            "message": self._sentence(problems or job.message), "progress": progress,
+            "seconds": self.jobs.running_for(job), "left_s": left_s, "output": job.output,
+            "options": job.options, "on": job.on,
             "views": [{"kind": kind, "href": f"/view/{job.number}/{kind}/"} for kind in kinds],
             "sentences": list(map(self._sentence, sentences)), "methods": methods and self._sentence(methods),
-            "outdated": self._outdated[1].get(job.number),
+            "outdated": self._outdated[1].get(job.number), "partly": bool(problems),
             # A command that rejected its input would reject it again.
             "can_continue": job.status in ("cancelled", "interrupted") or (job.status == "failed" and job.code != 2),
         }  # fmt: skip
@@ -208,6 +243,9 @@ class Studio:
             Route("/api/close", self._close_project, methods=["POST"]),
             Route("/api/folders", self._folders),
             Route("/api/specimens", self._upload, methods=["PUT"]),
+            Route("/api/volumes", self._upload_volume, methods=["PUT"]),
+            Route("/api/volumes", self._forget_volumes, methods=["DELETE"]),
+            Route("/api/labels", self._labels_of_volume, methods=["POST"]),
             Route("/api/import", self._take_files, methods=["POST"]),
             Route("/api/thumbnails/{id}", self._thumbnail),
             Route("/api/scans/{id}", self._scan),
@@ -271,8 +309,9 @@ class Studio:
         return json_response(
             {
                 "version": __version__, "project": None if self._open is None else self._open.facts(),
-                "recent": recent_projects(), "formats": list(MESH_ENDINGS), "upload_bytes": self._upload_bytes,
-                "landmark_formats": list(CONFIGURATION_ENDINGS),
+                "recent": recent_projects(), "formats": list(MESH_ENDINGS),
+                "landmark_formats": list(CONFIGURATION_ENDINGS), "volume_formats": list(_VOLUME_ENDINGS),
+                "upload_bytes": self._upload_bytes,
                 "units": list(MM_PER_UNIT), "read_only": self._read_only,
             }
         )  # fmt: skip
@@ -321,15 +360,44 @@ class Studio:
         if not name.lower().endswith(MESH_FILE_ENDINGS):
             raise HTTPException(415, f"{name} is not a scan that can be read; drop {', '.join(MESH_ENDINGS)}.")
         project = self._project.project
+        target = await self._store(request, name)
+        added, same_as = await run_in_threadpool(project.add_stored, target, role, name)
+        self._changed()
+        return json_response({"id": added, "same_as": same_as}, 201)
+
+    async def _store(self, request: Request, name: str) -> Path:
+        """Write the body of a request into a new file of the project."""
+        project = self._project.project
         limit = f"{name} is larger than the {self._upload_bytes / 2**20:g} MB that the studio takes."
         target = await run_in_threadpool(project.new_file, name)
         with project.removed_on_error(target), atomic_path(target) as path, path.open("wb") as file:
             async with aclosing(body_pieces(request, self._upload_bytes, limit)) as pieces:
                 async for piece in pieces:
                     file.write(piece)
-        added, same_as = await run_in_threadpool(project.add_stored, target, role, name)
-        self._changed()
-        return json_response({"id": added, "same_as": same_as}, 201)
+        return target
+
+    async def _upload_volume(self, request: Request) -> Response:
+        name = display_name(request.query_params.get("name", ""))
+        if not name.lower().endswith(_VOLUME_ENDINGS):
+            raise HTTPException(415, f"{name} is not a volume that can be read; drop {', '.join(_VOLUME_ENDINGS)}.")
+        target = await self._store(request, name)
+        return json_response({"file": target.relative_to(self._project.project.folder).as_posix()}, 201)
+
+    async def _labels_of_volume(self, request: Request) -> Response:
+        content = await json_body(request, _REQUEST_BYTES)
+        opened = self._project
+        [file] = stored_volumes(opened.project, [content.get("file")])
+        return json_response(await opened.checks.labels(opened.project.folder / file))
+
+    async def _forget_volumes(self, request: Request) -> Response:
+        """Remove uploaded volumes of which no surfaces were made."""
+        content = await json_body(request, _REQUEST_BYTES)
+        opened = self._project
+        used = {word for job in opened.jobs.all() for word in job.arguments}
+        for file in stored_volumes(opened.project, content.get("files")):
+            if file not in used:
+                (opened.project.folder / file).unlink(missing_ok=True)
+        return json_response({})
 
     async def _take_files(self, request: Request) -> Response:
         content = await json_body(request, _REQUEST_BYTES)
@@ -414,7 +482,8 @@ class Studio:
             except InputError as error:
                 return json_response([{"level": "problem", "text": str(error)}])
         given = cast(dict[str, Any], options) if isinstance(options, dict) else {}
-        found = await run_in_threadpool(checks, opened.project, self._forms, kind, given, shapes)
+        odd = [f"{name}: {odd.text}" for name, odd in opened.odd_scans().items()]
+        found = await run_in_threadpool(checks, opened.project, self._forms, kind, given, shapes, odd)
         return json_response([{**finding, "text": self._labels.sentence(finding["text"])} for finding in found])
 
     def _change_job(self, change: Callable[[Jobs, int], None], request: Request) -> Response:

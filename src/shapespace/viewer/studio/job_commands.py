@@ -9,13 +9,15 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
+from shapespace.batch.result_folder import names_for
 from shapespace.cohort.read import cohort_file_text
 from shapespace.cohort.table import Table, is_number, list_names
 from shapespace.errors import FileError, InputError, ShapespaceError
 from shapespace.io.landmarks.configuration_io import CONFIGURATION_FORMATS
 from shapespace.io.tables.table_io import DECIMAL_COMMA
+from shapespace.io.volume_io import VOLUME_ENDINGS
 from shapespace.model.shape_model import ShapeModel
 from shapespace.schemas import CorrespondRecord
 from shapespace.statistics.compare_formula import design_of
@@ -36,6 +38,9 @@ CORRESPONDENCES = ("correspond", "redo")
 _STUDY = (*CORRESPONDENCES, "build", "quality", "morphospace", *QUESTIONS[:-1], "fit", "complete")
 """Kinds of results in the report of the study, in the order of its chapters."""
 _INPUTS = "inputs"
+_NAMES = ("name", "files", "ids", "set")
+"""Keys of the options of a job that name scans or volumes; all others are options of its command."""
+_MOST_ODD = 5  # findings on single specimens in the checks
 _TERMINAL_NOTES = re.compile(
     r" \([^()]*(?:NAME\.|MODEL\.h5|about\.json)[^()]*\)|; exit with \d [^.;]*|(?m:^(?:next|usage): .*\n?)"
 )
@@ -113,7 +118,7 @@ def order(
         InputError: it cannot be run: no such kind or option, or a result or specimens are missing.
     """
     words = forms.get("correspond" if kind == "redo" else kind, {}).get("command", ())
-    given = [] if kind == "redo" else _option_arguments(forms, kind, options)
+    given = _option_arguments(forms, kind, {flag: options[flag] for flag in options if flag not in _NAMES})
     folder, stem = project.folder, f"{_INPUTS}/{number:04d}"
     state, listed = project.state, f"{stem}.csv"
     if kind == "correspond":
@@ -129,6 +134,16 @@ def order(
             raise InputError(f"There is no specimen {name[:40]!r}; choose one of the list.")
         files, prepared = project.scan_list(folder / listed, chosen)
         return Order((*words, listed, "--redo", name, "-o", before.output), before.output, prepared, files=files)
+    if kind == "surface":
+        output = f"surfaces/{number:04d}"
+        return Order((*words, *stored_volumes(project, options.get("files")), "-o", output, *given), output)
+    if kind == "groom":
+        ids = options.get("ids")
+        chosen = [specimen for specimen in state.specimens if isinstance(ids, list) and specimen.id in ids]
+        if not chosen or not given:
+            raise InputError("Select the specimens to groom, and choose a step.")
+        output = f"groomed/{number:04d}"
+        return Order((*words, *(specimen.file for specimen in chosen), "-o", output, *given, "--quiet"), output)
     if kind == "build":
         before = result_of(jobs, CORRESPONDENCES, on)
         output = f"model-{number}.h5"
@@ -197,6 +212,37 @@ def _landmark_names(model: Path, modified_s: float) -> frozenset[str]:
         return frozenset(ShapeModel.load(model).landmarks)
     except ShapespaceError:
         return frozenset()
+
+
+def stored_volumes(project: Project, files: Any) -> Sequence[str]:
+    """Return the paths of label volumes in the project.
+
+    Raises:
+        InputError: there are none, or a path is not that of a volume in the project.
+    """
+    files = cast(list[Any], files) if isinstance(files, list) else []
+    for file in files:
+        path = project.folder / str(file)
+        if path.parent != project.folder / "scans" or not path.name.lower().endswith(VOLUME_ENDINGS):
+            raise InputError(f"There is no volume {str(file)[:40]!r}; drop it again.")
+    if not files:
+        raise InputError("There is no volume with the chosen labels; drop label volumes.")
+    return files
+
+
+def groomed_scans(job: Job, folder: Path) -> dict[str, str]:
+    """Return the path of each scan that a job groomed -> path of the groomed scan, both as in `Specimen.file`.
+
+    Args:
+        job: job that groomed scans.
+        folder: folder of the project.
+    """
+    scans = job.arguments[1 : job.arguments.index("-o")]
+    paths = {
+        scan: f"{job.output}/{name}.ply"
+        for scan, name in zip(scans, names_for([folder / scan for scan in scans]), strict=True)
+    }
+    return {scan: path for scan, path in paths.items() if (folder / path).is_file()}
 
 
 def _question(
@@ -284,9 +330,19 @@ def _results_of_study(jobs: Sequence[Job]) -> list[Job]:
 
 
 def checks(
-    project: Project, forms: Forms, kind: str, options: Mapping[str, Any], shapes: Job | None
-) -> list[dict[str, str]]:
-    """Return findings on a question before it is run: a level (`ok`, `warning`, `problem`) and a sentence each."""
+    project: Project, forms: Forms, kind: str, options: Mapping[str, Any], shapes: Job | None,
+    odd: Sequence[str] = (),
+) -> list[dict[str, str]]:  # fmt: skip
+    """Return findings on a run before it is started: a level (`ok`, `warning`, `problem`) and a sentence each.
+
+    Args:
+        project: project with the specimens.
+        forms: forms of all kinds.
+        kind: kind of the job.
+        options: flag -> value, as sent by the page.
+        shapes: job whose shapes a question is about; None for other kinds.
+        odd: sentences on specimens that differ from the others.
+    """
     chosen = _specimens_of(project, shapes)
     columns = _used_columns(project.state.columns, options)
     missing = {column: sum(not specimen.cells.get(column) for specimen in chosen) for column in columns}
@@ -295,6 +351,9 @@ def checks(
     if drop_missing:
         chosen = [specimen for specimen in chosen if all(specimen.cells.get(column) for column in columns)]
     found = [{"level": "ok" if len(chosen) >= 2 else "problem", "text": f"Included specimens: {len(chosen)}."}]
+    if kind == "correspond":
+        rest = [f"{len(odd) - _MOST_ODD} more specimens differ from the others."] if len(odd) > _MOST_ODD else []
+        return [*found, *({"level": "warning", "text": text} for text in (*odd[:_MOST_ODD], *rest))]
     if shapes is not None and shapes.kind in CORRESPONDENCES:
         there = _surface_files(project, shapes, chosen)
         lacking = [specimen.id for specimen in chosen if specimen.id not in there]

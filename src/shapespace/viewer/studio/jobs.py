@@ -7,7 +7,7 @@ import json
 import shlex
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -15,17 +15,22 @@ from typing import Any, Literal
 from msgspec import Struct
 from msgspec.structs import replace
 
-from shapespace.errors import FileError, InputError
+from shapespace.errors import FileError, InputError, ShapespaceError
 from shapespace.io.files import make_folder, write_text
 from shapespace.schemas import json_text, read
 from shapespace.viewer.studio.run_job import CANCEL, EXIT, JOB, LOG, PARTLY, PROGRESS, is_running, start
 
 Status = Literal["waiting", "running", "done", "failed", "cancelled", "interrupted"]
 FOLDER = "jobs"
+TAKEN = "taken"
+"""File in the folder of a job whose result was taken into the project, with sentences on parts that were not."""
 _POLL_S = 0.3  # between looks at the running job
 _START_S = 30.0  # after which a process that does not lock its folder has failed to start
 _LOG_END = 4000  # bytes of the log in which the last message is searched
 _ENDED: tuple[Status, ...] = ("done", "failed", "cancelled", "interrupted")
+_OF_PROJECT = ("inputs/", "scans/", "surfaces/", "groomed/")
+"""Folders of scans and lists, to which lists refer: they stay in the project when its results are computed again."""
+_PROGRAM = "shapespace: "  # at the beginning of messages
 _NO_MESSAGE = "It ended without a message; look at its log."
 
 
@@ -101,11 +106,21 @@ class Jobs:
     Args:
         folder: folder of the project.
         changed: function that is called when a job changed.
+        takers: kind of a job -> function that takes the result of such a job into the project, called once after it
+            succeeded, also if the studio was closed then; it returns sentences on the parts that were not taken.
         read_only: whether to only read the jobs; nothing is started or written.
     """
 
-    def __init__(self, folder: Path, changed: Callable[[], None], *, read_only: bool = False) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        changed: Callable[[], None],
+        takers: Mapping[str, Callable[[Job], Sequence[str]]] | None = None,
+        *,
+        read_only: bool = False,
+    ) -> None:
         self._folder = folder / FOLDER
+        self._takers = takers or {}
         self._changed = changed
         self._lock = threading.RLock()
         self._jobs: dict[int, Job] = {}
@@ -119,6 +134,8 @@ class Jobs:
         self._thread = threading.Thread(target=self._work, name="studio jobs", daemon=True)
         if not read_only:
             self._write_history()
+            for job in self.all():
+                self._take(job)
             self._thread.start()
 
     def all(self) -> list[Job]:
@@ -191,6 +208,17 @@ class Jobs:
         except OSError:
             return ""
 
+    def problems(self, job: Job) -> str:
+        """Return the messages on inputs that a command could not use, and on results that were not taken."""
+        messages = [
+            line.removeprefix(_PROGRAM)
+            for line in self.log(job.number).splitlines()
+            if line.startswith(_PROGRAM) and not line.endswith("...")
+        ]  # progress ends so
+        with contextlib.suppress(OSError):
+            messages.append((self.folder_of(job) / TAKEN).read_text(encoding="utf-8"))
+        return " ".join(filter(None, messages))
+
     def progress(self, job: Job) -> dict[str, Any] | None:
         """Return the progress of a running job (`doing`, `done`, `total`, `left_s`); None if it is unknown."""
         try:
@@ -248,7 +276,15 @@ class Jobs:
             self._jobs[job.number] = job
             if job.status == "done":
                 self._write_history()
+                self._take(job)
             self._changed()
+
+    def _take(self, job: Job) -> None:
+        """Take the result of a job into the project; on a full disk it is tried again when the project is opened."""
+        taken = self.folder_of(job) / TAKEN
+        if job.status == "done" and job.kind in self._takers and not taken.exists():
+            with contextlib.suppress(ShapespaceError, OSError):
+                write_text(taken, " ".join(self._takers[job.kind](job)))
 
     def _write_history(self) -> None:
         """Write `history.sh` into the project's folder; a full disk does not prevent the end of a job."""
@@ -299,7 +335,7 @@ class Jobs:
             return _NO_MESSAGE
         lines = [line.strip() for line in content.splitlines() if line.strip()]
         messages = [line for line in lines if not line.startswith("next: ")]  # the page itself shows what comes next
-        return messages[-1].removeprefix("shapespace: ") if messages else _NO_MESSAGE
+        return messages[-1].removeprefix(_PROGRAM) if messages else _NO_MESSAGE
 
 
 def _modified_s(path: Path) -> float:
@@ -320,7 +356,9 @@ def history(jobs: list[Job]) -> str:
         'run() { "$@"; code=$?; [ $code -le 1 ] || { echo "This command failed: $*" >&2; exit $code; }; }',
     ]
     for arguments in (words for job in jobs if job.status == "done" for words in (*job.before, job.arguments)):
-        words = [f'"$PROJECT"/{shlex.quote(word)}' if word.startswith(("inputs/", "scans/")) else shlex.quote(word)
-                 for word in arguments]  # fmt: skip
+        words = [
+            f'"$PROJECT"/{shlex.quote(word)}' if word.startswith(_OF_PROJECT) else shlex.quote(word)
+            for word in arguments
+        ]
         lines.append(" ".join(["run", "shapespace", *words]))
     return "\n".join(lines) + "\n"

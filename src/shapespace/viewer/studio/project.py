@@ -36,6 +36,7 @@ from shapespace.io.files import atomic_path, make_folder, write_error, write_tex
 from shapespace.io.landmarks.landmark_io import read_surface_landmarks, surface_landmarks_text
 from shapespace.io.meshes.mesh_io import MESH_FILE_ENDINGS, mesh_files, stem_of
 from shapespace.io.tables.table_io import DECIMAL_COMMA, KEYS, key_column, table_text
+from shapespace.io.volume_io import VOLUME_ENDINGS
 from shapespace.schemas import json_text, read
 from shapespace.store.corresponding import LANDMARKS
 from shapespace.types import MM_PER_UNIT, SurfaceLandmarks
@@ -68,6 +69,7 @@ class Specimen(Struct, frozen=True, kw_only=True):
         included: whether the specimen is used.
         unit: unit of the scan, a name of `MM_PER_UNIT`; empty if commands read the scan as it is.
         mirrored: whether its mirror image is used.
+        original: path of the scan before it was groomed, like `file`; empty if it was not groomed.
         cells: column -> cell of the specimen.
         points: name -> landmark on the scan, in the frame and unit of its file.
     """
@@ -78,6 +80,7 @@ class Specimen(Struct, frozen=True, kw_only=True):
     included: bool = True
     unit: str = ""
     mirrored: bool = False
+    original: str = ""
     cells: dict[str, str] = {}
     points: dict[str, Point] = {}
 
@@ -307,8 +310,14 @@ class Project:
         with self._lock:
             try:
                 size = file.stat().st_size
-                for existing in self.state.specimens:
-                    other = self.path(existing)
+                scans = [
+                    (specimen, place)
+                    for specimen in self.state.specimens
+                    for place in (specimen.file, specimen.original)
+                    if place
+                ]
+                for existing, place in scans:
+                    other = self.folder / place
                     if other.is_file() and other.stat().st_size == size and filecmp.cmp(file, other, shallow=False):
                         return existing.id, existing.id
             except OSError as error:
@@ -356,6 +365,33 @@ class Project:
                 notes.append(f"{file.name} is the same file as {same}; it was not added again.")
             added += same is None
         return added, notes
+
+    # Results that become scans
+
+    def add_surfaces(self, folder: Path, role: Role) -> list[str]:
+        """Add the surfaces of label volumes in a folder of the project; return sentences on those not added."""
+        added = [(file.stem, self.add(file, role)[1]) for file in sorted(folder.glob("*.ply"))]
+        return [f"{name} is the same surface as {same}; it was not added." for name, same in added if same is not None]
+
+    def take_groomed(self, groomed: Mapping[str, str]) -> None:
+        """Use groomed scans; a specimen whose scan was changed since the start of the grooming keeps its scan.
+
+        Args:
+            groomed: path of a scan, as in `Specimen.file` -> path of the groomed scan.
+        """
+
+        def change(state: State) -> tuple[str, State]:
+            ids = [specimen.id for specimen in state.specimens if specimen.file in groomed]
+            return f"groom {_count_text(ids)}", _edit_specimens(
+                state,
+                ids,
+                lambda specimen: replace(
+                    specimen, file=groomed[specimen.file], original=specimen.original or specimen.file
+                ),
+            )
+
+        if any(specimen.file in groomed for specimen in self.state.specimens):
+            self.edit(None, change)
 
     # Files that commands read
 
@@ -560,7 +596,7 @@ def change_of(request: Mapping[str, Any]) -> Callable[[State], tuple[str, State]
     what = str(request.get("what", ""))
     edits = {
         "cells": _edit_cells, "block": _edit_block, "include": _include, "set": _set_role, "remove": _remove,
-        "rename": _rename, "unit": _set_unit, "mirror": _mirror, "add-column": _add_column,
+        "rename": _rename, "unit": _set_unit, "mirror": _mirror, "original": _use_original, "add-column": _add_column,
         "remove-column": _remove_column, "landmarks": _set_landmarks, "points": _edit_points,
         "point-names": _set_point_names,
     }  # fmt: skip
@@ -628,6 +664,14 @@ def _mirror(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
     ids, mirrored = request["ids"], bool(request["mirrored"])
     return f"mirror {_count_text(ids)}", _edit_specimens(
         state, ids, lambda specimen: replace(specimen, mirrored=mirrored)
+    )
+
+
+def _use_original(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
+    """Return the state in which groomed specimens have their original scans again."""
+    ids = request["ids"]
+    return f"use the original scan of {_count_text(ids)}", _edit_specimens(
+        state, ids, lambda specimen: replace(specimen, file=specimen.original or specimen.file, original="")
     )
 
 
@@ -820,7 +864,8 @@ def _count_text(ids: Iterable[str]) -> str:
 
 
 def _ending(name: str) -> str:
-    return next((end for end in sorted(MESH_FILE_ENDINGS, key=len, reverse=True) if name.lower().endswith(end)), "")
+    known = (*MESH_FILE_ENDINGS, *VOLUME_ENDINGS)
+    return next((end for end in sorted(known, key=len, reverse=True) if name.lower().endswith(end)), "")
 
 
 def _stem(name: str) -> str:

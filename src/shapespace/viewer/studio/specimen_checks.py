@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import hashlib
 import json
@@ -9,13 +10,15 @@ import multiprocessing
 import os
 import sys
 from collections.abc import Callable
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from shapespace.batch.workers import context, end_after
+from shapespace.correspondence.odd_scans import ScanMeasures
 from shapespace.errors import FileError, InputError, ShapespaceError
 from shapespace.geometry.doctor import examine_and_repair
 from shapespace.geometry.mirror_plane import mirror_image
@@ -64,6 +67,9 @@ class SpecimenChecks:
         except (OSError, ValueError):
             self._ask(key, scan)
             return None
+        if facts.get("state") == "ready" and "profile" not in facts:  # from an earlier version
+            self._ask(key, scan)
+            return None
         self._known[key] = facts
         return facts
 
@@ -77,6 +83,18 @@ class SpecimenChecks:
         The future raises a ShapespaceError if the scan cannot be read.
         """
         return self._processes().submit(pack_scan, scan, mirrored=mirrored)
+
+    async def labels(self, volume: Path) -> list[dict[str, Any]]:
+        """Return the labels of a volume, as `count_labels` returns them.
+
+        Raises:
+            ShapespaceError: it cannot be read, has no labels, or takes too much memory.
+        """
+        try:
+            return await asyncio.wrap_future(self._processes().submit(read_labels, volume))
+        except BrokenExecutor as error:
+            self._pool = None
+            raise InputError(f"{volume.name}: the memory does not suffice for it; crop or resample it.") from error
 
     def close(self) -> None:
         """End the processes."""
@@ -160,12 +178,32 @@ def check_scan(scan: Path, stem: Path) -> dict[str, Any]:
             "extent": 0.0 if repaired is None else float(report.extent.max()), "findings": findings,
         }  # fmt: skip
         if repaired is not None:
+            measures = ScanMeasures.of(repaired)
+            facts |= {"size": measures.size, "profile": measures.profile.tolist()}
             picture, _ = mesh_still(repaired)
             write_bytes(stem.with_suffix(".webp"), picture)
     except ShapespaceError as error:
         facts = _unusable(_without_folder(error, scan))
     write_text(stem.with_suffix(".json"), json.dumps(facts))
     return facts
+
+
+def read_labels(volume: Path) -> list[dict[str, Any]]:
+    """Return the labels of a volume, as `count_labels` returns them.
+
+    Raises:
+        InputError: it cannot be read, has no labels, or takes too much memory.
+    """
+    from shapespace.geometry.volume_surface import count_labels
+    from shapespace.io.volume_io import default_limit_bytes, read_volume
+
+    try:
+        counts = count_labels(read_volume(volume, max_memory_bytes=default_limit_bytes()))
+    except MemoryError as error:
+        raise InputError(f"{volume.name}: the memory does not suffice for it; crop or resample it.") from error
+    except ShapespaceError as error:
+        raise InputError(_without_folder(error, volume)) from error
+    return [asdict(count) for count in counts]
 
 
 def pack_scan(scan: Path, *, mirrored: bool) -> bytes:
