@@ -74,6 +74,9 @@
     if (JSON.stringify(before.columns) === JSON.stringify(state.project.columns)) state.project.columns = before.columns;
   }
 
+  // Scans may have been replaced in another program, which sends no event.
+  addEventListener("focus", () => { if (Studio.state) refresh().catch(() => {}); });
+
   function listen() {
     const events = new EventSource("/api/events");
     const offline = document.getElementById("offline");

@@ -112,9 +112,10 @@ class OpenProject:
     def facts(self) -> dict[str, Any]:
         """Return the state for the page."""
         project, state, jobs = self.project, self.project.state, self.jobs.all()
-        key = (state, [(job.number, job.status) for job in jobs])
+        scans = project.scan_keys(state.specimens)
+        key = (state, scans, [(job.number, job.status) for job in jobs])
         if key != self._outdated[0]:
-            self._outdated = key, outdated_results(project, jobs, self._forms)
+            self._outdated = key, outdated_results(project, jobs, self._forms, scans)
         specimens: list[dict[str, Any]] = []
         for specimen in state.specimens:
             facts = self.checks.facts(project.path(specimen)) or {
@@ -123,6 +124,7 @@ class OpenProject:
             specimens.append({
                 "id": specimen.id, "file": specimen.file, "set": specimen.role, "included": specimen.included,
                 "unit": specimen.unit, "mirrored": specimen.mirrored, "cells": specimen.cells, **facts,
+                "scan": scans[specimen.id],
                 "findings": [{**finding, "text": self._sentence(finding["text"])} for finding in facts["findings"]],
             })  # fmt: skip
         return {
@@ -387,7 +389,8 @@ class Studio:
         opened = self._project
 
         def make(number: int, before: list[Job]) -> Order:
-            return order(opened.project, before, self._forms, kind, cast(dict[str, Any], options), on, number)
+            scans = opened.project.scan_keys(opened.project.state.specimens)
+            return order(opened.project, before, self._forms, kind, cast(dict[str, Any], options), on, number, scans)
 
         job = await run_in_threadpool(opened.jobs.add, kind, make, cast(dict[str, Any], options))
         return json_response({"number": job.number}, 201)

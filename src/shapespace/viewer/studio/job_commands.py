@@ -5,8 +5,11 @@ from __future__ import annotations
 
 import csv
 import io
+import os
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from functools import lru_cache
 from typing import Any, Literal
 
 from shapespace.cohort.read import cohort_file_text
@@ -16,6 +19,7 @@ from shapespace.io.tables.table_io import DECIMAL_COMMA
 from shapespace.schemas import CorrespondRecord
 from shapespace.statistics.compare_formula import design_of
 from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS
+from shapespace.store.results import Results
 from shapespace.viewer.studio.jobs import Job, Order
 from shapespace.viewer.studio.project import Project, Specimen
 
@@ -92,7 +96,7 @@ class OptionLabels:
 
 def order(
     project: Project, jobs: Sequence[Job], forms: Forms, kind: str, options: Mapping[str, Any], on: int | None,
-    number: int,
+    number: int, scans: Mapping[str, str] = {},
 ) -> Order:  # fmt: skip
     """Return the command of a new job, with the files that it reads.
 
@@ -104,6 +108,7 @@ def order(
         options: flag -> value, as sent by the page.
         on: number of the job whose result it uses; None for the newest that succeeded.
         number: number of the new job.
+        scans: id of each specimen -> key of its scan, for the record of the scans that are read.
 
     Raises:
         InputError: it cannot be run: no such kind or option, or a result or specimens are missing.
@@ -116,13 +121,17 @@ def order(
         chosen = _require_specimens(state.chosen("training"), "to bring into correspondence", 2)
         content, prepared = project.scan_list(folder / listed, chosen)
         output = f"correspondence-{number}"
-        return Order((*words, listed, "-o", output, *given), output, prepared, files={listed: content})
+        return Order(
+            (*words, listed, "-o", output, *given), output, prepared, files={listed: content},
+            scans=_keys_of(chosen, scans),
+        )  # fmt: skip
     if kind == "redo":
         before = result_of(jobs, CORRESPONDENCES, on)
         name = str(options.get("name", ""))
-        if name not in {specimen.id for specimen in state.specimens}:
+        chosen = [specimen for specimen in state.specimens if specimen.id == name]
+        if not chosen:
             raise InputError(f"There is no specimen {name[:40]!r}; choose one of the list.")
-        return Order((*words, "--redo", name, "-o", before.output), before.output)
+        return Order((*words, "--redo", name, "-o", before.output), before.output, scans=_keys_of(chosen, scans))
     if kind == "build":
         before = result_of(jobs, CORRESPONDENCES, on)
         output = f"model-{number}.h5"
@@ -137,17 +146,21 @@ def order(
         return Order((*words, *_surfaces(project, before), "-o", output, *marks, *given), output, files=files)
     if kind == "quality":
         output = f"quality-{number}"
-        return Order((*words, result_of(jobs, CORRESPONDENCES, on).output, "-o", output, *given), output)
+        surfaces = _surfaces(project, result_of(jobs, CORRESPONDENCES, on))
+        return Order((*words, *surfaces, "-o", output, *given), output)
     if kind in ("fit", "complete"):
         model = result_of(jobs, ("build",), on).output
         chosen = _require_specimens(state.chosen("new"), "to fit; drop new scans", 1)
         content, prepared = project.scan_list(folder / listed, chosen)
         output = f"{'fits' if kind == 'fit' else 'completed'}-{number}"
-        return Order((*words, model, listed, "-o", output, *given), output, prepared, files={listed: content})
+        return Order(
+            (*words, model, listed, "-o", output, *given), output, prepared, files={listed: content},
+            scans=_keys_of(chosen, scans),
+        )  # fmt: skip
     if kind == "report" and on is None:
         output = f"report-{number}/report.html"
         results = [job.output for job in _results_of_study(jobs)]
-        files = {listed: project.table(state.specimens)}
+        files = {listed: project.table(specimen for specimen in state.specimens if specimen.included)}
         return Order((*words, *results, "--specimens", listed, "-o", output, "--no-open", *given), output, files=files)
     if kind == "report":
         before = result_of(jobs, (*CORRESPONDENCES, "fit"), on)
@@ -160,8 +173,12 @@ def order(
         output = f"exported-{number}{_model_ending(to)}"
         return Order((*words, model, output, *given), output)
     if kind == "export":
-        output = f"exported-{number}"
-        return Order((*words, result_of(jobs, ("fit",), on).output, "--all", "-o", output, *given), output)
+        output, fits = f"exported-{number}", result_of(jobs, ("fit",), on).output
+        excluded = {specimen.id for specimen in state.specimens if not specimen.included and specimen.role == "new"}
+        names = [name for name in Results(folder / fits).names() if name not in excluded] if excluded else ["--all"]
+        if not names:
+            raise InputError(f"All specimens of {fits} are excluded; include one.")
+        return Order((*words, fits, *names, "-o", output, *given), output)
     if kind not in QUESTIONS:
         raise InputError(f"There is no action {kind[:30]!r}; reload the page.")
     return _question(project, jobs, kind, words, given, options, on, number)
@@ -340,33 +357,45 @@ Outdated = Literal["specimens", "table", "landmarks", "redone", "source"]
 landmarks, the correspondence, in which a scan was registered again, or a result that it was computed from."""
 
 
-def outdated_results(project: Project, jobs: Sequence[Job], forms: Forms) -> dict[int, Outdated]:
+def outdated_results(
+    project: Project, jobs: Sequence[Job], forms: Forms, scans: Mapping[str, str] = {}
+) -> dict[int, Outdated]:
     """Return what changed since results were computed, by the numbers of their jobs; other results are up to date.
 
     A result is up to date if the command for the same choices, with the same source, and the files that it would read
-    are those of its job; of tables only the columns count that it uses.
+    are those of its job; of tables only the columns count that it uses. `scans` has the present key of the scan of each
+    specimen by its id.
     """
     found: dict[int, Outdated] = {}
+    present = _keys_of([specimen for specimen in project.state.specimens if specimen.included], scans)
     done = [job for job in jobs if job.status == "done"]
+    paths = {job.number: job.paths for job in done}
     for job in done:
         earlier = [other for other in done if other.number < job.number]
-        sources = [other for other in earlier if _reads(job, other.output)]
-        redone = [other.output for other in done if other.kind == "redo" and other.number > job.number]
-        if (
-            job.kind in (*_STUDY, "report")
+        sources = [other for other in earlier if other.output in paths[job.number]]
+        redone = [other for other in done if other.kind == "redo" and other.number > job.number]
+        has_outdated_source = any(source.number in found for source in sources)
+        read = dict(job.scans)
+        for other in redone:
+            read |= other.scans if other.output == job.output else {}
+        if job.kind != "redo" and any(present.get(name, key) != key for name, key in read.items()):
+            found[job.number] = "specimens"
+        elif (
+            job.kind in (*_STUDY, "report", "export")
             and not (job.kind == "redo" or (job.kind == "report" and "--specimens" not in job.arguments))
             and (change := _change_since(project, earlier, forms, job, sources))
+            and not (job.kind == "report" and change == "specimens" and has_outdated_source)
         ):
             found[job.number] = change
-        elif any(_reads(job, output) and output != job.output for output in redone):
+        elif any(other.output in paths[job.number] and other.output != job.output for other in redone):
             found[job.number] = "redone"
-        elif any(source.number in found for source in sources):
+        elif has_outdated_source:
             found[job.number] = "source"
     return found
 
 
-def _reads(job: Job, output: str) -> bool:
-    return any(word == output or word.startswith(f"{output}/") for word in job.arguments)
+def _keys_of(specimens: Sequence[Specimen], scans: Mapping[str, str]) -> dict[str, str]:
+    return {specimen.id: scans[specimen.id] for specimen in specimens if specimen.id in scans}
 
 
 def _change_since(
@@ -393,7 +422,7 @@ def _change_since(
         elif name.endswith(".csv"):
             columns = {*project.state.columns, *next(csv.reader(io.StringIO(before)))}
             used = {"id", "file"} if is_each else {"specimen", "subject", *_used_columns(sorted(columns), job.options)}
-            used = columns if job.kind == "report" else used
+            used = frozenset(columns if job.kind == "report" else used)
             rows, rows_before = _rows_of(content, used), _rows_of(before, used)
             if rows != rows_before and not (is_each and all(row in rows_before for row in rows)):
                 is_same = not is_each and [row[:1] for row in rows] == [row[:1] for row in rows_before]
@@ -401,8 +430,9 @@ def _change_since(
     return None
 
 
-def _rows_of(table: str, columns: Collection[str]) -> list[list[str]]:
-    """Return the rows of a table with some of its columns, sorted."""
+@lru_cache(maxsize=256)
+def _rows_of(table: str, columns: frozenset[str]) -> list[list[str]]:
+    """Return the rows of a table with some of its columns, sorted; the tables of most jobs are the same."""
     header, *rows = csv.reader(io.StringIO(table))
     kept = [k for k, name in enumerate(header) if name in columns]
     return sorted([row[k] for k in kept] for row in rows)
@@ -460,8 +490,11 @@ def _surfaces(project: Project, before: Job) -> list[str]:
 
 def _surface_files(project: Project, shapes: Job, specimens: Sequence[Specimen]) -> dict[str, str]:
     """Return id -> path in the project's folder of the surface in correspondence, of the specimens that have one."""
-    paths = {specimen.id: f"{shapes.output}/{specimen.id}{CorrespondRecord.SURFACE}" for specimen in specimens}
-    return {name: path for name, path in paths.items() if (project.folder / path).is_file()}
+    files = {specimen.id: f"{specimen.id}{CorrespondRecord.SURFACE}" for specimen in specimens}
+    with suppress(FileNotFoundError):
+        there = {entry.name for entry in os.scandir(project.folder / shapes.output)}
+        return {name: f"{shapes.output}/{file}" for name, file in files.items() if file in there}
+    return {}
 
 
 def _model_ending(name: str) -> str:

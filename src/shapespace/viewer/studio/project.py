@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import filecmp
+import hashlib
 import io
 import json
 import re
@@ -33,6 +34,7 @@ Role = Literal["training", "new"]
 _AGAIN = "restore it from a copy, or start a new project"
 _MOST_CLASSES = 12  # classes of a column that the page counts
 _MOST_UNDONE = 100  # edits that can be undone
+_MOST_TABLES = 32  # texts of tables that are kept: of all specimens, those of each role, and parts of them
 _LONGEST_ID, _LONGEST_CELL = 100, 1000  # characters
 _NO_FILE_NAME = re.compile(r'[/\\:*?"<>|\x00-\x1f]')
 STALE = "Another tab changed the project; look at it and do it again."
@@ -118,6 +120,7 @@ class Project:
         self.revision = 0
         self._undo: list[tuple[str, State]] = []
         self._redo: list[tuple[str, State]] = []
+        self._tables: list[tuple[tuple[object, ...], str]] = []
         self._lock = threading.RLock()
 
     @staticmethod
@@ -160,6 +163,10 @@ class Project:
     def path(self, specimen: Specimen) -> Path:
         """Return the path of a scan."""
         return self.folder / specimen.file
+
+    def scan_keys(self, specimens: Iterable[Specimen]) -> dict[str, str]:
+        """Return the key of the scan of each specimen by its id, see `scan_key`."""
+        return {specimen.id: scan_key(self.path(specimen)) for specimen in specimens}
 
     def edit(self, revision: int | None, change: Callable[[State], tuple[str, State]], *, together: str = "") -> None:
         """Apply an edit, which can be undone.
@@ -338,8 +345,11 @@ class Project:
             path: path of the list, in a folder of the project.
             specimens: specimens of the list.
         """
-        columns, commands = self.state.columns, list[tuple[str, ...]]()
-        files = {specimen.id: _relative(self.path(specimen), path.parent) for specimen in specimens}
+        commands = list[tuple[str, ...]]()
+        files = {
+            specimen.id: specimen.file if Path(specimen.file).is_absolute() else f"../{specimen.file}"
+            for specimen in specimens
+        }
         for unit, mirrored in sorted({(specimen.unit, specimen.mirrored) for specimen in specimens} - {("", False)}):
             group = [specimen for specimen in specimens if (specimen.unit, specimen.mirrored) == (unit, mirrored)]
             folder = f"{path.stem}-{unit or 'scans'}{'-mirrored' if mirrored else ''}"
@@ -350,17 +360,25 @@ class Project:
             scans = [specimen.file for specimen in group]
             options = [*([f"--unit={unit}"] if unit else []), *(["--mirror"] if mirrored else [])]
             commands.append(("check", *scans, "-o", f"{path.parent.name}/{folder}", *options, "--quiet"))
-        rows = [
-            (specimen.id, files[specimen.id], *(specimen.cells.get(column, "") for column in columns))
-            for specimen in specimens
-        ]
-        return table_text(("id", "file", *columns), rows), tuple(commands)
+        return self._table_text(("id", "file"), specimens, tuple(files.values())), tuple(commands)
 
     def table(self, specimens: Iterable[Specimen]) -> str:
         """Return the table of specimens, as `compare` reads it."""
-        columns = self.state.columns
-        rows = [(specimen.id, *(specimen.cells.get(column, "") for column in columns)) for specimen in specimens]
-        return table_text(("specimen", *columns), rows)
+        return self._table_text(("specimen",), specimens, ())
+
+    def _table_text(self, header: tuple[str, ...], specimens: Iterable[Specimen], files: tuple[str, ...]) -> str:
+        """Return the table of specimens, and of their files if there are any; all jobs ask for it after each edit."""
+        columns, chosen = self.state.columns, tuple(specimens)
+        content = (header, columns, chosen, files)
+        text = next((text for known, text in self._tables if known == content), None)
+        if text is None:
+            rows = [
+                (specimen.id, *files[k : k + 1], *(specimen.cells.get(column, "") for column in columns))
+                for k, specimen in enumerate(chosen)
+            ]
+            text = table_text((*header, *columns), rows)
+            self._tables = [(content, text), *self._tables[: _MOST_TABLES - 1]]
+        return text
 
     def landmark_table(self) -> str:
         """Return the landmarks as a table of name and vertex."""
@@ -680,6 +698,16 @@ def _count_text(ids: Iterable[str]) -> str:
     return names[0] if len(names) == 1 else f"{len(names)} specimens"
 
 
+def scan_key(scan: Path) -> str:
+    """Return a key that changes with the content of a scan: that of its name, size and time of change."""
+    try:
+        stat = scan.stat()
+        text = f"{scan.name}|{stat.st_size}|{stat.st_mtime_ns}"  # without the folder: projects are moved
+    except OSError:
+        text = f"{scan}|missing"
+    return hashlib.sha256(text.encode(errors="surrogateescape")).hexdigest()[:24]
+
+
 def _ending(name: str) -> str:
     return next((end for end in sorted(MESH_FILE_ENDINGS, key=len, reverse=True) if name.lower().endswith(end)), "")
 
@@ -694,12 +722,6 @@ def _free_name(stem: str, taken: set[str], ending: str = "") -> str:
     """Return the first of stem, stem-2, stem-3, ... that is not `taken` (in lower case) with its ending."""
     numbered = (f"{stem}{'' if number == 1 else f'-{number}'}{ending}" for number in count(1))
     return next(name for name in numbered if name.casefold() not in taken)
-
-
-def _relative(path: Path, folder: Path) -> str:
-    """Return `path` relative to `folder` if both lie in the same project, else as it is."""
-    project = folder.parent
-    return f"../{path.relative_to(project).as_posix()}" if path.is_relative_to(project) else str(path)
 
 
 def recent_projects(add: Path | None = None) -> list[dict[str, Any]]:

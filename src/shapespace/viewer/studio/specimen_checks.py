@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import multiprocessing
 import os
@@ -25,6 +24,7 @@ from shapespace.report.render.scene import decimate, pack
 from shapespace.report.render.thumbnails import mesh_still
 from shapespace.types import Mesh
 from shapespace.viewer.fitting import lower_priority
+from shapespace.viewer.studio.project import scan_key
 
 _FOLDER = "checks"
 _MOST_PROCESSES = 4
@@ -33,7 +33,7 @@ _MOST_BORDERS = 50_000  # edges of borders that are drawn
 
 
 class SpecimenChecks:
-    """The owner of the checks of a project's scans. Files are identified by name, size and time of change.
+    """The owner of the checks of a project's scans, which are identified by `scan_key`.
 
     Args:
         folder: folder of the project.
@@ -56,7 +56,7 @@ class SpecimenChecks:
 
     def facts(self, scan: Path) -> dict[str, Any] | None:
         """Return the facts of a scan, or None while it is checked; the first call asks for the check."""
-        key = _key(scan)
+        key = scan_key(scan)
         if key in self._known:
             return self._known[key]
         try:
@@ -69,7 +69,7 @@ class SpecimenChecks:
 
     def picture(self, scan: Path) -> Path:
         """Return the path of the picture of a scan, which exists once it was checked and is usable."""
-        return self._folder / f"{_key(scan)}.webp"
+        return self._folder / f"{scan_key(scan)}.webp"
 
     def surface(self, scan: Path, *, mirrored: bool) -> Future[bytes]:
         """Return the packed surface of a scan for a view, as it is in its file or reflected at x = 0.
@@ -79,9 +79,11 @@ class SpecimenChecks:
         return self._processes().submit(pack_scan, scan, mirrored=mirrored)
 
     def close(self) -> None:
-        """End the processes."""
+        """End the processes after the checks that they make now."""
         if self._pool is not None:
-            self._pool.shutdown(wait=False, cancel_futures=True)
+            # Without a wait its thread may close a pipe while the end of the program writes into it: "Bad file
+            # descriptor"; and a check may be written after the lock of the project was released.
+            self._pool.shutdown(wait=True, cancel_futures=True)
 
     def _ask(self, key: str, scan: Path) -> None:
         if key in self._asked or self._read_only:
@@ -190,12 +192,3 @@ def _without_folder(error: ShapespaceError, scan: Path) -> str:
 def _unusable(text: str) -> dict[str, Any]:
     findings = [{"level": "refused", "text": text}]
     return {"state": "unusable", "vertices": 0, "triangles": 0, "extent": 0.0, "findings": findings}
-
-
-def _key(scan: Path) -> str:
-    try:
-        stat = scan.stat()
-        text = f"{scan.name}|{stat.st_size}|{stat.st_mtime_ns}"  # without the folder: projects are moved
-    except OSError:
-        text = f"{scan}|missing"
-    return hashlib.sha256(text.encode(errors="surrogateescape")).hexdigest()[:24]
