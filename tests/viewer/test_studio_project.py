@@ -270,6 +270,31 @@ def test_rows_without_a_specimen_and_new_columns_are_shown_before_a_block_is_pas
             match(weighed, text)
 
 
+def test_cells_that_would_become_empty_are_shown_before_a_block_is_pasted(weighed: Project) -> None:
+    edit(weighed, what="cells", cells=[{"id": name, "column": "weight", "value": "7"} for name in ids(weighed)])
+    named = match(weighed, "id\tsex\tweight\nanna\tf\tNA\nben\tm\ncarl\tm\tn/a")
+    assert named.by_name and not named.certain and named.cells["anna"]["weight"] == named.cells["ben"]["weight"] == ""
+    short, missing = named.notes
+    assert short == "1 row is shorter than the others: its last cells become empty."
+    assert missing == "2 cells are marked as missing (NA, n/a), and will be empty."
+    placed = match(weighed, "f\nm\t6\nm\tNA", "sex")
+    assert not placed.by_name and placed.cells["anna"] == {"sex": "f", "weight": ""} == {
+        **placed.cells["carl"],
+        "sex": "f",
+    }
+    assert [note.split()[1] for note in placed.notes] == ["row", "cell"]
+    assert not match(weighed, "f\tNA", "sex", "ben").certain  # also of one row
+    assert match(weighed, "id\tsex\tweight\nanna\tf\t\nben\tm\t6\ncarl\tm\t6").certain  # empty in the sheet too
+
+
+def test_a_group_is_not_written_over_what_another_tab_wrote(weighed: Project) -> None:
+    group = [{"id": name, "column": "sex", "value": "f", "before": ""} for name in ("anna", "ben")]
+    edit(weighed, what="cells", cells=[{"id": "ben", "column": "sex", "value": "m"}])
+    with pytest.raises(StaleError, match="Another tab changed sex of ben to 'm'"):
+        edit(weighed, what="cells", cells=group)
+    assert [one.cells.get("sex", "") for one in weighed.state.specimens] == ["", "m", ""]
+
+
 def test_a_cell_that_another_tab_changed_while_it_was_typed_is_not_overwritten(weighed: Project) -> None:
     cell = {"id": "ben", "column": "sex", "value": "m", "before": ""}
     edit(weighed, what="cells", cells=[{**cell, "value": "f"}])

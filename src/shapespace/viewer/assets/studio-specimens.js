@@ -115,11 +115,14 @@
     const { columns } = Studio.state.project;
     const [column, setColumn] = useState(columns[0] || S.groupColumn);
     const [value, setValue] = useState("");
+    const seen = useRef(Studio.state.project.specimens); // the cells that the user saw; another tab may change them in the meantime
     const save = async (event) => {
       event.preventDefault();
       const name = column.trim();
+      const before = Object.fromEntries(seen.current.map((one) => [one.id, one.cells[name] || ""]));
       const isThere = columns.includes(name) || (await Studio.edit({ what: "add-column", column: name }));
-      if (isThere && (await Studio.edit({ what: "cells", cells: ids.map((id) => ({ id, column: name, value })) }))) onclose();
+      if (isThere && (await Studio.edit({ what: "cells", cells: ids.map((id) => ({ id, column: name, value, before: before[id] })) }))) onclose();
+      else seen.current = Studio.state.project.specimens;
     };
     return html`
       <form class="row inline" data-testid="group-form" onsubmit=${save}>

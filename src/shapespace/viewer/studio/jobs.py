@@ -70,7 +70,7 @@ class Job(Struct, frozen=True, kw_only=True):
 
     @property
     def paths(self) -> frozenset[str]:
-        """Outputs of jobs that its command reads or writes: its arguments, and the first folders of these."""
+        """Outputs of jobs that its command reads or writes: its arguments, and the first folder of each argument."""
         return frozenset(self.arguments).union(word.partition("/")[0] for word in self.arguments)
 
 

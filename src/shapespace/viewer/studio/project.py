@@ -25,7 +25,7 @@ from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.containers.json_files import read_json
 from shapespace.io.files import atomic_path, make_folder, write_error, write_text
 from shapespace.io.meshes.mesh_io import MESH_FILE_ENDINGS, mesh_files, stem_of
-from shapespace.io.tables.table_io import DECIMAL_COMMA, KEYS, key_column, table_text
+from shapespace.io.tables.table_io import DECIMAL_COMMA, KEYS, MISSING, key_column, table_text
 from shapespace.schemas import json_text, read
 from shapespace.types import MM_PER_UNIT
 
@@ -34,7 +34,7 @@ Role = Literal["training", "new"]
 _AGAIN = "restore it from a copy, or start a new project"
 _MOST_CLASSES = 12  # classes of a column that the page counts
 _MOST_UNDONE = 100  # edits that can be undone
-_MOST_TABLES = 32  # texts of tables that are kept: of all specimens, those of each role, and parts of them
+_MOST_TABLES = 32  # texts of tables that are kept: jobs read those of few sets of specimens
 _LONGEST_ID, _LONGEST_CELL = 100, 1000  # characters
 _NO_FILE_NAME = re.compile(r'[/\\:*?"<>|\x00-\x1f]')
 STALE = "Another tab changed the project; look at it and do it again."
@@ -431,6 +431,7 @@ class PastedBlock(Struct, frozen=True, kw_only=True):
         if not width:
             raise InputError("The pasted block has no cells; copy cells of a spreadsheet.")
         rows = [[*map(str.strip, row), *[""] * (width - len(row))] for row in self.rows]
+        gaps = _emptied(sum(len(row) < width for row in self.rows), [cell for row in rows for cell in row])
         columns = list(state.columns[state.columns.index(self.column) :] if self.column in state.columns else ())
         has_heading = key_column(rows[0]) is not None
         if width == 1 and not self.column:
@@ -443,7 +444,7 @@ class PastedBlock(Struct, frozen=True, kw_only=True):
         named = [fold_name(row[0].replace("\\", "/").rpartition("/")[2]) in known for row in rows]
         has_names = any(name and not is_number(row[0]) for name, row in zip(named, rows, strict=True))
         if not has_heading and self.column and not (has_names and width > 1):
-            return self._by_position(rows, columns)
+            return self._by_position(rows, columns, gaps)
         heads = rows[0][1:]
         is_new = not named[0] and any(named) and not any(map(is_number, heads))
         has_heads = all(heads) and len(set(heads)) == len(heads) and (is_new or set(heads) <= set(state.columns))
@@ -452,19 +453,20 @@ class PastedBlock(Struct, frozen=True, kw_only=True):
             header if has_heading else [KEYS[0], *header[1:]],
             rows,
             state,
+            gaps,
             is_sure=has_heading,
             is_asked=bool(self.column),
         )
 
     def _by_name(
-        self, header: list[str], rows: list[list[str]], state: State, *, is_sure: bool, is_asked: bool
+        self, header: list[str], rows: list[list[str]], state: State, gaps: list[str], *, is_sure: bool, is_asked: bool
     ) -> MatchedBlock:
         width = max(map(len, self.rows))
         text = io.StringIO()
         csv.writer(text, delimiter="\t").writerows([header[:width], *(row[: len(header)] for row in rows)])
         pasted, cells, notes = cells_of_table(text.getvalue().encode(), state, "The pasted block")
         new = tuple(column for column in pasted if column not in state.columns)
-        notes += _beyond(width - len(header), "column")
+        notes += [*gaps, *_beyond(width - len(header), "column")]
         names = {fold_name(column) for column in state.columns}
         is_sure = is_sure and not any(fold_name(column) in names for column in new)
         return MatchedBlock(
@@ -475,8 +477,8 @@ class PastedBlock(Struct, frozen=True, kw_only=True):
             notes=tuple(notes),
         )
 
-    def _by_position(self, rows: list[list[str]], columns: list[str]) -> MatchedBlock:
-        notes: list[str] = []
+    def _by_position(self, rows: list[list[str]], columns: list[str], gaps: list[str]) -> MatchedBlock:
+        notes = gaps
         if rows[0] == columns[: len(rows[0])] and len(rows) > 1:
             notes.append("The first row contains the headings of these columns, and is not pasted.")
             rows = rows[1:]
@@ -486,8 +488,21 @@ class PastedBlock(Struct, frozen=True, kw_only=True):
             values = [own[column] for own in cells.values() if column in own]
             for own in cells.values():
                 if column in own:
-                    own[column] = _with_point(own[column], values)
+                    own[column] = "" if own[column].lower() in MISSING else _with_point(own[column], values)
         return MatchedBlock(cells=cells, by_name=False, certain=not notes and len(rows) == 1, notes=tuple(notes))
+
+
+def _emptied(short_rows: int, cells: Sequence[str]) -> list[str]:
+    """Return sentences on the cells of a block that become empty although they are absent, or have a text."""
+    marks = [cell for cell in cells if cell and cell.lower() in MISSING]
+    notes: list[str] = []
+    if short_rows:
+        rows = "1 row is shorter than the others: its" if short_rows == 1 else f"{short_rows} rows are shorter: their"
+        notes.append(f"{rows} last cells become empty.")
+    if marks:
+        word = "1 cell is" if len(marks) == 1 else f"{len(marks)} cells are"
+        notes.append(f"{word} marked as missing ({', '.join(dict.fromkeys(marks))}), and will be empty.")
+    return notes
 
 
 def _beyond(count: int, noun: str) -> list[str]:
