@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from shapespace.cli.answers import reason_of_rejection
 from shapespace.cli.options import Option
 from shapespace.formats.registry import MODEL_FORMATS
 from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS
@@ -111,7 +112,8 @@ _LABELS: Mapping[str, str] = {
 
 
 def forms(commands: Mapping[str, tuple[str, Sequence[Option]]]) -> dict[str, dict[str, Any]]:
-    """Return kind -> the words, label and summary of its command, and the options of its form.
+    """Return kind -> the words, label and summary of its command, the options of its form, and of a question the
+    function that checks its input.
 
     Args:
         commands: name -> summary and options, of all commands.
@@ -121,7 +123,7 @@ def forms(commands: Mapping[str, tuple[str, Sequence[Option]]]) -> dict[str, dic
         command = _KINDS.get(kind, kind)
         made[kind] = {
             "command": tuple(command.split()), "label": _ACTIONS[kind], "is_question": kind in _QUESTIONS,
-            **_make_form(kind, *commands[command], first)
+            **_make_form(kind, *commands[command], first), "check": reason_of_rejection
         }  # fmt: skip
     made["convert"]["options"][0] |= {"kind": "choice", "choices": list(MODEL_FORMATS)}
     made["score"]["options"][0] |= {"kind": "class", "help": "class that the others are compared with"}

@@ -7,26 +7,34 @@ import csv
 import io
 import os
 import re
+import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
+import numpy as np
+
 from shapespace.cohort.read import cohort_file_text
-from shapespace.cohort.table import Table, is_number, list_names
-from shapespace.errors import InputError, ShapespaceError
+from shapespace.cohort.table import is_number, list_names
+from shapespace.errors import InputError
+from shapespace.io.files import make_folder
+from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.io.tables.table_io import DECIMAL_COMMA
-from shapespace.schemas import CorrespondRecord
-from shapespace.statistics.compare_formula import design_of
+from shapespace.schemas import CorrespondenceRecord, CorrespondRecord
 from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS
 from shapespace.store.results import Results
+from shapespace.types import Mesh
 from shapespace.viewer.studio.jobs import Job, Order
 from shapespace.viewer.studio.project import Project, Specimen
 
 Forms = Mapping[str, Mapping[str, Any]]
-"""Kind -> `command` (its words), `label`, `summary`, and `options`, each with `flag`, `argument`, `label`, `help`,
-`kind`, `choices`, `initial`, `visible` and `required`; `argument` is `--set NAME` for a setting, and empty for a
-positional argument."""
+"""Kind -> `command` (its words), `label`, `summary`, `is_question`, `check`, a function of the arguments and of folders
+that returns why the command of a question would reject its input, and `options`, each with `flag`, `argument`,
+`label`, `help`, `kind`, `choices`, `initial`, `visible` and `required`; `argument` is `--set NAME` for a setting, and
+empty for a positional argument."""
 
 QUESTIONS = (
     "compare", "change", "asymmetry", "regress", "score", "identify", *(test.name for test in SHAPE_TESTS),
@@ -36,6 +44,9 @@ CORRESPONDENCES = ("correspond", "redo")
 _STUDY = (*CORRESPONDENCES, "build", "quality", "morphospace", *QUESTIONS[:-1], "fit", "complete")
 """Kinds of results in the report of the study, in the order of its chapters."""
 _INPUTS = "inputs"
+_LEAST_WAYS = 60  # in which small surfaces of a check vary; few, so that the check of many specimens takes no time
+_OF_SURFACES = ("--geometry", "--landmarks", "--length", "--modules", "--pairs", "--region", "--stable")
+"""Options that depend on the vertices of surfaces, so that small ones cannot stand for them in a check."""
 _TERMINAL_NOTES = re.compile(
     r" \([^()]*(?:NAME\.|MODEL\.h5|about\.json)[^()]*\)|; exit with \d [^.;]*|(?m:^(?:next|usage): .*\n?)"
 )
@@ -66,7 +77,10 @@ class OptionLabels:
         self._action = re.compile(rf"(?:\bshapespace ({names})\b(?! \S+ -\w\b)|\b({names})(?= --))( (?=--))?")
 
         self.forms = {
-            kind: {**form, "options": [{**option, "help": self.sentence(option["help"])} for option in form["options"]]}
+            kind: {
+                "options": [{**option, "help": self.sentence(option["help"])} for option in form["options"]],
+                **{name: form[name] for name in ("command", "label", "is_question", "summary")},
+            }
             for kind, form in forms.items()
         }
 
@@ -181,15 +195,12 @@ def order(
         return Order((*words, fits, *names, "-o", output, *given), output)
     if kind not in QUESTIONS:
         raise InputError(f"There is no action {kind[:30]!r}; reload the page.")
-    return _question(project, jobs, kind, words, given, options, on, number)
+    return _question(project, shapes_of(jobs, kind, on), forms, kind, options, number)
 
 
-def _question(
-    project: Project, jobs: Sequence[Job], kind: str, words: tuple[str, ...], given: Sequence[str],
-    options: Mapping[str, Any], on: int | None, number: int,
-) -> Order:  # fmt: skip
+def _question(project: Project, shapes: Job, forms: Forms, kind: str, options: Mapping[str, Any], number: int) -> Order:
+    words, given = forms[kind]["command"], _option_arguments(forms, kind, options)
     stem, output = f"{_INPUTS}/{number:04d}", f"{kind}-{number}"
-    shapes = shapes_of(jobs, kind, on)
     chosen = _specimens_of(project, shapes)
     if kind == "score":
         reference, others = _by_class(chosen, options.get("--reference"))
@@ -319,7 +330,6 @@ def checks(
             found.append({"level": "ok", "text": f"{column}: {len(classes)} values."})
         if len(classes) == 1:
             found.append({"level": "problem", "text": f"{column} has one value for all specimens; nothing can differ."})
-    are_known = not any(missing.values()) or drop_missing
     for option in forms.get(kind, {}).get("options", ()):
         value = str(options.get(option["flag"]) or "").strip()
         text = ""
@@ -327,29 +337,66 @@ def checks(
             text = f"Choose a value of {option['flag']}."
         elif value and option["kind"] == "number" and not is_number(value):
             text = f"{option['flag']}: {value[:40]!r} is not a number."
-        elif value and option["kind"] == "formula" and are_known and len(chosen) >= 2:
-            text = _problem_of_formula(value, project.state.columns, chosen)
-        elif (
-            value in columns
-            and option["flag"] in ("--group", "--points")
-            and len(chosen) == len({specimen.cells.get(value) for specimen in chosen})
-        ):
-            text = f"{value} has another value for each specimen; choose a column of classes."
         if text:
             found.append({"level": "problem", "text": text})
+    if not any(finding["level"] == "problem" for finding in found):
+        reason = _reason_of_rejection(project, forms, kind, options, shapes, [specimen.id for specimen in chosen])
+        for column in columns if reason else ():
+            is_group = column in (options.get("--group"), options.get("--points"))
+            if is_group and len(chosen) == len({specimen.cells.get(column) for specimen in chosen}):
+                reason = f"{column} has another value for each specimen; choose a column of classes."
+        found += [{"level": "problem", "text": reason}] if reason else []
     return found
 
 
-def _problem_of_formula(formula: str, columns: Sequence[str], specimens: Sequence[Specimen]) -> str:
-    """Return why a formula cannot be used for specimens whose named cells are known; empty if it can."""
-    cells = {column: tuple(specimen.cells.get(column, "") for specimen in specimens) for column in columns}
-    sizes = tuple(str(1 + k) for k in range(len(specimens)))  # any numbers: the sizes of shapes are not known yet
-    table = Table({"log_size": sizes, **cells}, tuple(specimen.id for specimen in specimens), "The table")
-    try:
-        design_of(formula, table)
-    except ShapespaceError as error:
-        return str(error)
-    return ""
+def _reason_of_rejection(
+    project: Project, forms: Forms, kind: str, options: Mapping[str, Any], shapes: Job | None, names: Sequence[str]
+) -> str:
+    """Return why the command of a question would reject its input; empty if it would not, or cannot be asked.
+
+    It is asked with the table, options and fits of the project, and small surfaces of the same names in place of those
+    in correspondence, which would take too long to read.
+    """
+    shapes = shapes or Job(number=0, kind="correspond", arguments=(), output="shapes")
+    if kind == "power" and re.fullmatch(r"corrected|[\d.]+x", str(options.get("--effect") or "corrected")):
+        options = {**options, "--effect": "observed"}  # whether there is such an effect depends on the real surfaces
+    with TemporaryDirectory(prefix="shapespace-check-", ignore_cleanup_errors=True) as name:
+        folder = Path(name)
+        try:
+            made = _question(project, shapes, forms, kind, options, 0)
+            made.write_files(folder)
+            if shapes.kind == "fit":
+                (folder / shapes.output).symlink_to(project.folder / shapes.output)
+            else:
+                ways = [int(options[flag]) for flag in ("--components", "--modes") if str(options.get(flag)).isdigit()]
+                _write_small_surfaces(project, shapes, names, folder, max(_LEAST_WAYS, *ways, 0))
+        except InputError as error:
+            return str(error)
+        except OSError:
+            return ""  # Windows does not allow links to all users
+        way = ["--set", "surfaces=coefficients"] if shapes.kind == "fit" else []
+        is_parsed_only = any(options.get(flag) for flag in _OF_SURFACES)
+        folders = [] if is_parsed_only else [folder, project.folder]
+        reason = str(forms[kind]["check"]([*made.arguments, *way], folders))
+        reason = reason.replace(str(folder / next(iter(made.files))), "The table")
+        return reason.replace(f"{folder}{os.sep}", "").replace(f"{project.folder}{os.sep}", "")
+
+
+def _write_small_surfaces(project: Project, shapes: Job, names: Sequence[str], folder: Path, ways: int) -> None:
+    """Write small symmetric surfaces, which vary in `ways` ways, into `folder`: for each name that has one in `shapes`,
+    or all if `shapes` has no folder, with its record."""
+    rng = np.random.default_rng(0)
+    half = rng.normal([4.0, 0.0, 0.0], size=(min(ways, len(names)) // 6 + 6, 3))
+    template = np.concatenate([half, half * (-1.0, 1.0, 1.0)])
+    triangles = np.arange(len(half) - 2)[:, None] + np.arange(3)
+    faces = np.concatenate([triangles, triangles[:, ::-1] + len(half)]).astype(np.int32)
+    source, target = project.folder / shapes.output, make_folder(folder / shapes.output)
+    for name in names:
+        if not source.is_dir() or (source / f"{name}{CorrespondRecord.SURFACE}").is_file():
+            vertices = template + 0.1 * rng.normal(size=template.shape)
+            write_mesh(target / f"{name}{CorrespondRecord.SURFACE}", Mesh(vertices, faces))
+    if (source / CorrespondenceRecord.FILE).is_file():
+        shutil.copyfile(source / CorrespondenceRecord.FILE, target / CorrespondenceRecord.FILE)
 
 
 Outdated = Literal["specimens", "table", "landmarks", "redone", "source"]
