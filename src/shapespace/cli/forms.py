@@ -175,7 +175,7 @@ _HELPS: Mapping[str, str] = {
     "error on these is measured too",
     "figures --views": "names of the views to draw, with commas, such as dorsal,lateral (default: all views)",
     "score --reference": "class that the others are compared with",
-    "regress --hold": "for shapes along a number: class of another column for which they are predicted",
+    "hold": "for shapes along a number: class of another column for which they are predicted",
 }
 """Option, named as for its label -> help of an option whose help on the command line is about files or the terminal."""
 
