@@ -13,7 +13,7 @@ from shapespace.cli.forms import forms
 from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.report.analyses.analysis_report import histogram_part
 from shapespace.schemas import CorrespondRecord
-from shapespace.viewer.studio.job_commands import QUESTIONS, checks, order
+from shapespace.viewer.studio.job_commands import QUESTIONS, OptionLabels, checks, order
 from shapespace.viewer.studio.jobs import Job
 from shapespace.viewer.studio.project import Project
 from synthetic_shapes import training_meshes
@@ -134,6 +134,14 @@ def test_what_the_command_rejects_is_found_before_the_run(
     assert code == 2, said
     if kind != "score":  # whose reference is a file that names the shapes relative to it
         assert reason.split(": ", 1)[-1] in said.replace(str(tmp_path / "inputs" / "0002.csv"), "The table")
+
+
+def test_reasons_are_sentences_with_the_labels_of_the_page(project: Project) -> None:
+    labels = OptionLabels(FORMS)
+    [reason] = problems(project, "pairwise", {**GOOD["pairwise"], "--permutations": "0"})
+    assert labels.sentence(reason) == "The option “Permutations” must be at least 1"
+    [reason] = problems(project, "compare", {**GOOD["compare"], "--imputations": "-1"})
+    assert labels.sentence(reason).startswith("The option “Samples of completed shapes”")
 
 
 def test_many_permutations_are_not_computed_in_a_check(project: Project) -> None:

@@ -43,7 +43,7 @@ def reason_of_rejection(words: Sequence[str], folders: Sequence[Path]) -> str:
 
     class RaisingParser(CommandParser):
         def error(self, message: str) -> NoReturn:
-            raise InputError(message)
+            raise InputError(f"{self.prog}: error: {message}")
 
     try:
         arguments = parser(RaisingParser).parse_args([*words, "--quiet"])
