@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -62,20 +62,16 @@ def reason_of_rejection(words: Sequence[str], folders: Sequence[Path]) -> str:
     return ""
 
 
-@contextmanager
-def _steps(arguments: argparse.Namespace, count: int | None, doing: str, what: str) -> Generator[Progress]:
-    """Yield the function of a progress bar; that of a question that is only checked ends it."""
+def _end_check(done: int, total: int) -> None:
+    raise InputAccepted
+
+
+def _steps(arguments: argparse.Namespace, count: int | None, doing: str, what: str) -> AbstractContextManager[Progress]:
+    """Return a context with the function of a progress bar; that of a question that is only checked ends it."""
     from shapespace.batch.progress import steps
 
-    if hasattr(arguments, "only_check"):
-
-        def end(done: int, total: int) -> None:
-            raise InputAccepted
-
-        yield end
-    else:
-        with steps(count, doing, what, quiet=arguments.quiet) as step:
-            yield step
+    is_checked = hasattr(arguments, "only_check")
+    return nullcontext(_end_check) if is_checked else steps(count, doing, what, quiet=arguments.quiet)
 
 
 def column_value(text: str, option: str) -> tuple[str, str]:
