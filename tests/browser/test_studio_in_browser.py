@@ -433,6 +433,21 @@ def test_pasted_rows_find_their_specimens_and_a_second_tab_and_a_press_lose_noth
         tab.page.locator("#message").wait_for()
         assert "Another tab changed mass of B8 to '8'" in tab.page.locator("#message").inner_text()
         assert stored("mass")["B8"] == "8" and cell.input_value() == "8"
+        # Nor does a group that is made, until the user has seen the other value.
+        for name in ("B8", "B9"):
+            tab.page.get_by_test_id(f"select-{name}").click()
+        tab.page.get_by_test_id("group-selected").click()
+        tab.page.get_by_test_id("group-column").fill("mass")
+        tab.page.get_by_test_id("group-value").fill("big")
+        other.page.get_by_test_id("cell-B9-mass").fill("9")
+        other.page.keyboard.press("Enter")
+        tab.until("document.querySelector('[data-testid=cell-B9-mass]').value === '9'")
+        tab.page.get_by_test_id("group-save").click()
+        tab.until("document.getElementById('message').innerText.includes(\"changed mass of B9 to '9'\")")
+        assert (stored("mass")["B8"], stored("mass")["B9"]) == ("8", "9")
+        tab.page.get_by_test_id("group-save").click()
+        tab.page.get_by_test_id("group-form").wait_for(state="detached")
+        assert (stored("mass")["B8"], stored("mass")["B9"]) == ("big", "big")
         # Nothing moves between press and release, so that the first click on Run counts.
         tab.page.get_by_test_id("tab-correspondence").click()
         long = tab.page.locator("[data-testid=form-correspond] .option:has(details.hint) >> visible=true").first

@@ -220,6 +220,19 @@ def test_the_command_writes_what_the_report_reads_and_curves(
     assert (out / "quality.svg").read_bytes() == first
 
 
+def test_meshes_of_a_folder_are_one_target_as_their_folder_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write(blobs(), tmp_path / "a")
+    options = ["-o", str(tmp_path / "out"), "--folds", "3", "--samples", "4", "--quiet", "--json"]
+    measured: list[object] = []
+    for targets in ([folder], sorted(folder.glob("*.ply")), sorted(folder.glob("*.ply"))[:8]):
+        assert cli.main(["quality", *map(str, targets), *options]) == 0
+        content = json.loads(capsys.readouterr().out)
+        measured.append([content[name] for name in ("settings", "compactness", "generalisation", "specificity")])
+    assert measured[0] == measured[1] != measured[2]
+
+
 def test_two_folders_and_a_model_stand_side_by_side(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from shapespace.schemas import read
 

@@ -1,6 +1,7 @@
 """The project of the studio: what its edits do, what undo takes back, and what is refused."""
 
 import json
+import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,9 +17,10 @@ from shapespace.commands.inputs import given_scans
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.files import make_folder
 from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
+from shapespace.io.tables.table_io import table_text
 from shapespace.schemas import CorrespondRecord
 from shapespace.types import Mesh
-from shapespace.viewer.studio.job_commands import checks, order, outdated_results
+from shapespace.viewer.studio.job_commands import QUESTIONS, checks, order, outdated_results
 from shapespace.viewer.studio.jobs import Job, Order, history
 from shapespace.viewer.studio.project import (
     MatchedBlock,
@@ -268,6 +270,31 @@ def test_rows_without_a_specimen_and_new_columns_are_shown_before_a_block_is_pas
             match(weighed, text)
 
 
+def test_cells_that_would_become_empty_are_shown_before_a_block_is_pasted(weighed: Project) -> None:
+    edit(weighed, what="cells", cells=[{"id": name, "column": "weight", "value": "7"} for name in ids(weighed)])
+    named = match(weighed, "id\tsex\tweight\nanna\tf\tNA\nben\tm\ncarl\tm\tn/a")
+    assert named.by_name and not named.certain and named.cells["anna"]["weight"] == named.cells["ben"]["weight"] == ""
+    short, missing = named.notes
+    assert short == "1 row is shorter than the others: its last cells become empty."
+    assert missing == "2 cells are marked as missing (NA, n/a), and will be empty."
+    placed = match(weighed, "f\nm\t6\nm\tNA", "sex")
+    assert not placed.by_name and placed.cells["anna"] == {"sex": "f", "weight": ""} == {
+        **placed.cells["carl"],
+        "sex": "f",
+    }
+    assert [note.split()[1] for note in placed.notes] == ["row", "cell"]
+    assert not match(weighed, "f\tNA", "sex", "ben").certain  # also of one row
+    assert match(weighed, "id\tsex\tweight\nanna\tf\t\nben\tm\t6\ncarl\tm\t6").certain  # empty in the sheet too
+
+
+def test_a_group_is_not_written_over_what_another_tab_wrote(weighed: Project) -> None:
+    group = [{"id": name, "column": "sex", "value": "f", "before": ""} for name in ("anna", "ben")]
+    edit(weighed, what="cells", cells=[{"id": "ben", "column": "sex", "value": "m"}])
+    with pytest.raises(StaleError, match="Another tab changed sex of ben to 'm'"):
+        edit(weighed, what="cells", cells=group)
+    assert [one.cells.get("sex", "") for one in weighed.state.specimens] == ["", "m", ""]
+
+
 def test_a_cell_that_another_tab_changed_while_it_was_typed_is_not_overwritten(weighed: Project) -> None:
     cell = {"id": "ben", "column": "sex", "value": "m", "before": ""}
     edit(weighed, what="cells", cells=[{**cell, "value": "f"}])
@@ -384,11 +411,11 @@ class Done:
 
     def run(self, kind: str, options: dict[str, str] | None = None, on: int | None = None) -> int:
         number = len(self.jobs) + 1
-        made = order(self.project, self.jobs, self.forms, kind, options or {}, on, number)
+        made = order(self.project, self.jobs, self.forms, kind, options or {}, on, number, self.scans)
         made.write_files(self.project.folder)
         self.jobs.append(
             Job(number=number, kind=kind, arguments=made.arguments, output=made.output, before=made.before,
-                options=options or {}, on=made.on, status="done")
+                options=options or {}, on=made.on, scans=dict(made.scans), status="done")
         )  # fmt: skip
         if kind == "correspond":
             for name in ids(self.project):
@@ -396,8 +423,12 @@ class Done:
         return number
 
     @property
+    def scans(self) -> dict[str, str]:
+        return self.project.scan_keys(self.project.state.specimens)
+
+    @property
     def outdated(self) -> dict[int, str]:
-        return dict(outdated_results(self.project, self.jobs, self.forms))
+        return dict(outdated_results(self.project, self.jobs, self.forms, self.scans))
 
 
 @pytest.fixture
@@ -448,6 +479,72 @@ def test_results_are_outdated_by_the_edits_that_they_depend_on_and_by_no_others(
     answered.run("redo", {"name": "ben"})
     assert answered.outdated == {2: "redone", 3: "redone", 4: "redone", 5: "redone"}
     assert answered.run("build") == 7 and 7 not in answered.outdated
+
+
+def test_results_are_outdated_by_scans_that_are_replaced_under_the_same_path(answered: Done) -> None:
+    project = answered.project
+    anna = project.path(project.state.specimens[0])
+    before = anna.stat()
+    tetrahedron(anna, 9.0)
+    everything = {1: "specimens", 2: "source", 3: "source", 4: "source", 5: "source"}
+    assert answered.outdated == everything
+    answered.run("redo", {"name": "anna"})  # which reads the new scan
+    assert answered.outdated == {2: "redone", 3: "redone", 4: "redone", 5: "redone"}
+    answered.jobs.pop()
+    assert answered.run("correspond") not in answered.outdated
+    answered.jobs.pop()
+    edit(project, what="include", ids=["anna"], included=False)
+    assert answered.outdated == {2: "specimens", 3: "specimens", 4: "specimens", 5: "source"}  # as before the change
+    project.undo(project.revision)
+    tetrahedron(anna, 1.0)
+    os.utime(anna, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert answered.outdated == {}
+
+
+def test_the_table_is_written_once_for_all_results_that_are_compared_with_it(
+    answered: Done, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for column in ("group", "age") * 10:
+        answered.run("compare", {"--formula": f"~ {column}"})
+    written: list[object] = []
+    monkeypatch.setattr(f"{Project.__module__}.table_text", lambda *table: written.append(table) or table_text(*table))
+    edit(answered.project, what="cells", cells=[{"id": "ben", "column": "group", "value": "b"}])
+    assert len(answered.outdated) == 12 and len(written) == 2  # that of the scans, and that of the specimens
+
+
+@pytest.mark.parametrize("kind", sorted({*forms(summaries_and_options()), "study"} - {"convert", "figures", "export"}))
+def test_specimens_that_are_excluded_are_in_no_result(answered: Done, kind: str) -> None:
+    project = answered.project
+    for k, name in enumerate(("dora", "emil", "fritz")):
+        project.add(tetrahedron(project.new_file(f"{name}.ply"), 5.0 + k), "new")
+    join_table(project, b"id,group,age\ndora,a,4\nemil,b,5\nfritz,a,6\n")
+    project.add(tetrahedron(project.new_file("gina.ply"), 8.0), "training")
+    tetrahedron(project.folder / "correspondence-1" / f"gina{CorrespondRecord.SURFACE}", 1.0)
+    edit(project, what="include", ids=["anna", "dora"], included=False)
+    answered.jobs.append(Job(number=6, kind="fit", arguments=("fit", "model-2.h5"), output="fits-6", status="done"))
+    options = {"--reference": "group=a"} if kind == "score" else {}
+    if kind == "score":
+        edit(project, what="cells", cells=[{"id": "ben", "column": "group", "value": "a"},
+                                           {"id": "gina", "column": "group", "value": "a"}])  # fmt: skip
+    made = order(project, answered.jobs, answered.forms, "report" if kind == "study" else kind, options, None, 7)
+    content = " ".join([*made.arguments, *made.files.values()])
+    assert "anna" not in content and "dora" not in content
+    assert "correspondence-1" not in made.arguments or kind in QUESTIONS or kind in ("report", "study")
+
+
+def test_fits_of_excluded_specimens_are_not_exported(answered: Done) -> None:
+    project = answered.project
+    for k, name in enumerate(("dora", "emil")):
+        project.add(tetrahedron(project.new_file(f"{name}.ply"), 5.0 + k), "new")
+        (make_folder(project.folder / "fits-6") / f"{name}.fit.json").write_text("{}")
+    answered.jobs.append(Job(number=6, kind="fit", arguments=("fit", "model-2.h5"), output="fits-6", status="done"))
+    assert answered.run("export") == 7 and answered.jobs[-1].arguments[2:] == ("--all", "-o", "exported-7")
+    edit(project, what="include", ids=["dora"], included=False)
+    assert answered.outdated[7] == "specimens"
+    assert answered.run("export") == 8 and answered.jobs[-1].arguments[2:] == ("emil", "-o", "exported-8")
+    edit(project, what="include", ids=["emil"], included=False)
+    with pytest.raises(InputError, match="All specimens of fits-6 are excluded"):
+        answered.run("export")
 
 
 def test_a_result_that_is_run_again_with_the_same_settings_is_up_to_date(answered: Done) -> None:

@@ -3,6 +3,7 @@
 import errno
 import os
 import subprocess
+import threading
 import time
 import zipfile
 from collections.abc import Callable, Iterator
@@ -106,6 +107,17 @@ def test_dropped_scans_are_checked_pictured_and_listed(tmp_path: Path) -> None:
         answer = client.get("/api/scans/broken")
         assert answer.status_code == 422 and str(tmp_path) not in answer.json()["error"]
         assert client.get("/api/scans/nobody").status_code == 404
+
+
+def test_a_scan_that_is_replaced_under_its_path_is_checked_and_pictured_again(tmp_path: Path) -> None:
+    with studio(tmp_path / "p") as client:
+        upload(client, tmp_path, 1)
+        first = until(client, lambda now: now["specimens"][0]["state"] == "ready")["specimens"][0]
+        (tmp_path / "p" / first["file"]).write_bytes(tetrahedron(tmp_path / "new.ply", 50.0).read_bytes())
+        assert state(client)["specimens"][0]["scan"] != first["scan"]  # of which the address of the picture is made
+        again = until(client, lambda now: now["specimens"][0]["state"] == "ready")["specimens"][0]
+        assert again["extent"] > 10 * first["extent"]
+        assert client.get("/api/thumbnails/s0").content[8:12] == b"WEBP"
 
 
 def test_a_usable_scan_is_never_excluded_however_often_its_check_is_asked_for(tmp_path: Path) -> None:
@@ -301,6 +313,103 @@ def test_a_cancelled_job_can_be_continued(tmp_path: Path) -> None:
         assert wait_for(jobs, number, "done", "failed").status == "done"
     finally:
         jobs.close()
+
+
+def statuses(jobs: Jobs) -> dict[int, str]:
+    return {job.number: job.status for job in jobs.all()}
+
+
+def test_independent_jobs_run_together_and_jobs_on_the_same_results_wait(tmp_path: Path) -> None:
+    jobs = Jobs(tmp_path, lambda: None, at_once=3)
+    try:
+        long = command(jobs, "data", "bones", "--count", "3000", "-o", "out-1")
+        reader = jobs.add("build", lambda number, before: Order(("build", "out-1", "-o", "m.h5"), "m.h5")).number
+        changed = jobs.add("redo", lambda number, before: Order(("build", "out-1", "-o", "out-1"), "out-1")).number
+        after = jobs.add("build", lambda number, before: Order(("build", "m.h5/x", "-o", "out-4"), "out-4")).number
+        free = command(jobs, "data", "bones", "--count", "2", "-o", "out-5")
+        assert wait_for(jobs, free, "done", "failed").status == "done"
+        assert statuses(jobs) == {
+            long: "running",
+            reader: "waiting",
+            changed: "waiting",
+            after: "waiting",
+            free: "done",
+        }
+        jobs.cancel(reader)
+        jobs.cancel(after)
+        jobs.cancel(long)
+        assert wait_for(jobs, long, "cancelled", "done").status == "cancelled"
+        wait_for(jobs, changed, "failed")  # it waited for the end of the job that writes its input
+    finally:
+        jobs.close()
+
+
+def test_no_more_jobs_run_than_cores_allow_and_they_start_in_order(tmp_path: Path) -> None:
+    most: list[int] = []
+
+    def changed() -> None:
+        most.append(sum(job.status == "running" for job in jobs.all()))
+
+    jobs = Jobs(tmp_path, changed, at_once=2)
+    try:
+        numbers = [command(jobs, "data", "bones", "--count", "2", "-o", f"out-{k}") for k in (1, 2, 3, 4)]
+        for number in numbers:
+            assert wait_for(jobs, number, "done", "failed").status == "done"
+            assert all(jobs.get(other).status != "waiting" for other in numbers if other < number)
+        assert max(most) == 2
+        assert [line.split()[-1] for line in (tmp_path / "history.sh").read_text().splitlines()[-4:]] == [
+            "out-1", "out-2", "out-3", "out-4",
+        ]  # fmt: skip
+    finally:
+        jobs.close()
+
+
+def test_two_jobs_go_on_without_the_server_and_the_next_one_waits_for_the_cores(tmp_path: Path) -> None:
+    jobs = Jobs(tmp_path, lambda: None, at_once=2)
+    numbers = [command(jobs, "data", "bones", "--count", "6", "-o", f"out-{k}") for k in (1, 2, 3)]
+    for number in numbers[:2]:
+        wait_for(jobs, number, "running", "done")
+    jobs.close()  # as a server that is killed
+    again = Jobs(tmp_path, lambda: None, at_once=2)
+    try:
+        assert again.get(3).status == "waiting" or "running" not in {again.get(k).status for k in (1, 2)}
+        for number in numbers:
+            assert wait_for(again, number, "done", "failed", "interrupted").status == "done"
+            assert len(list((tmp_path / f"out-{number}").glob("*.ply"))) == 6
+    finally:
+        again.close()
+
+
+def test_the_page_is_not_drawn_again_while_two_jobs_report_the_same_progress(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(f"{Jobs.__module__}.start", lambda folder: folder)
+    monkeypatch.setattr(f"{Jobs.__module__}.is_running", lambda folder: True)
+    changes: list[int] = []
+    jobs = Jobs(tmp_path, lambda: changes.append(1), at_once=2)
+    try:
+        for k in (1, 2):
+            number = command(jobs, "data", f"{k}")
+            (jobs.folder_of(jobs.get(number)) / run_job.PROGRESS).write_text('{"doing": "x"}')
+            wait_for(jobs, number, "running")
+        time.sleep(1.0)
+        before = len(changes)
+        time.sleep(1.0)
+        assert len(changes) == before
+    finally:
+        jobs.close()
+
+
+def test_the_processes_of_checks_have_ended_when_the_checks_are_closed(tmp_path: Path) -> None:
+    """A thread of theirs that ends with the program may close a pipe that the program writes into."""
+    before = {thread.name for thread in threading.enumerate()} | {process.name for process in active_children()}
+    checks = SpecimenChecks(tmp_path / "p", lambda: None, lambda _: None)
+    for k in range(6):
+        checks.facts(tetrahedron(tmp_path / f"s{k}.ply", 1.0 + k))
+    checks.close()
+    files = set((tmp_path / "p").rglob("*"))
+    left = {thread.name for thread in threading.enumerate()} | {process.name for process in active_children()}
+    assert left <= before and files == set((tmp_path / "p").rglob("*"))
 
 
 def test_a_job_whose_process_was_killed_is_interrupted(tmp_path: Path) -> None:

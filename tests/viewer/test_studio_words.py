@@ -16,6 +16,9 @@ __all__ = ["own_home"]  # a fixture
 
 SOURCE = Path(shapespace.__file__).parent
 TERMINAL = re.compile(r"(?<![\w-])--\w|\bin Python\b|=(?:True|False|None|yes|no|drop)\b|NAME\.|\bexit (?:code|with)\b")
+PLACES = re.compile(r"[A-Z]{2,}[,=][A-Z]|:[A-Z]{2,}|\bCSV\b|\bJSON\b|can be repeated|name,vertex|\bverify\b")
+"""Placeholders of values and files on the command line."""
+EXAMPLE = re.compile(r"such as |\bdefault:? (?:\d|[a-z]+\b)|: \w+, ")
 FILES = re.compile(r"\.(?:npz|json|h5)\b|\bNone\b|\bDATA\b")
 COMMAND_LINES = (
     "cli",
@@ -105,6 +108,21 @@ def test_forms_have_labels_and_help_for_readers_of_the_page(kind: str) -> None:
         words = f"{option['label']}. {option['help']}"
         assert TERMINAL.search(words) is None and FILES.search(words) is None, words
         assert option["label"][0].isupper()
+
+
+@pytest.mark.parametrize("kind", sorted(FORMS))
+def test_helps_of_texts_have_an_example_of_what_to_type_and_no_words_for_files(kind: str) -> None:
+    for option in LABELS.forms[kind]["options"]:
+        flag, help_text = option["flag"], option["help"]
+        assert not PLACES.search(help_text), (flag, help_text)
+        if option["kind"] == "text" and not option["initial"]:
+            assert EXAMPLE.search(help_text), (flag, help_text)
+
+
+def test_initial_texts_of_forms_are_as_they_can_be_typed() -> None:
+    initial = {(kind, one["flag"]): one["initial"] for kind, form in FORMS.items() for one in form["options"]}
+    assert (initial["power", "--sizes"], initial["morphospace", "--axes"]) == ("10,20,40", "1,2")
+    assert not [key for key, text in initial.items() if text and " " in text]
 
 
 def test_texts_of_the_page_have_no_words_of_the_terminal() -> None:

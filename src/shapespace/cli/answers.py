@@ -3,26 +3,75 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from shapespace.cli.options import given
 from shapespace.cli.printing import warn
 from shapespace.commands.outcome import Outcome
-from shapespace.errors import InputError
+from shapespace.errors import InputError, ShapespaceError
 
 if TYPE_CHECKING:
     from shapespace.cohort.cohort import Cohort
     from shapespace.cohort.read import Surfaces
     from shapespace.report.analyses.analysis_report import AnalysisReport
     from shapespace.statistics.identity.trial import IdentityConfig
+    from shapespace.step_counter import Progress
 
 
 _Result = TypeVar("_Result")
+
+
+class InputAccepted(Exception):  # noqa: N818 - no error
+    """Ends a question whose input is only checked, as it begins to compute."""
+
+
+def reason_of_rejection(words: Sequence[str], folders: Sequence[Path]) -> str:
+    """Return why the command of a question would reject its input; empty if it begins to compute.
+
+    Args:
+        words: arguments of the command.
+        folders: folders of its files, the first one first; paths that none of them has are of the last one. Without
+            folders only the options are checked.
+    """
+    from shapespace.cli.arguments import CommandParser, parser
+
+    class RaisingParser(CommandParser):
+        def error(self, message: str) -> NoReturn:
+            raise InputError(f"{self.prog}: error: {message}")
+
+    try:
+        arguments = parser(RaisingParser).parse_args([*words, "--quiet"])
+        if not folders:
+            return ""
+        for name, value in vars(arguments).items():
+            if isinstance(value, Path):
+                there = (folder / value for folder in folders if (folder / value).exists())
+                setattr(arguments, name, next(there, folders[-1] / value))
+        arguments.only_check = True
+        arguments.run(arguments)
+    except ShapespaceError as error:
+        return str(error)
+    except InputAccepted:
+        pass
+    return ""
+
+
+def _end_check(done: int, total: int) -> None:
+    raise InputAccepted
+
+
+def _steps(arguments: argparse.Namespace, count: int | None, doing: str, what: str) -> AbstractContextManager[Progress]:
+    """Return a context with the function of a progress bar; that of a question that is only checked ends it."""
+    from shapespace.batch.progress import steps
+
+    is_checked = hasattr(arguments, "only_check")
+    return nullcontext(_end_check) if is_checked else steps(count, doing, what, quiet=arguments.quiet)
 
 
 def column_value(text: str, option: str) -> tuple[str, str]:
@@ -114,9 +163,7 @@ def _compute_and_report(
         report: function that makes the report of the result.
         count: number of steps, if it is known.
     """
-    from shapespace.batch.progress import steps
-
-    with steps(count, doing, what, quiet=arguments.quiet) as step:
+    with _steps(arguments, count, doing, what) as step:
         result = compute(progress=step)
     return _write_report(report(result), arguments)
 
@@ -124,6 +171,8 @@ def _compute_and_report(
 def _write_report(report: AnalysisReport, arguments: argparse.Namespace) -> Outcome:
     from shapespace.commands.answers import write_answer
 
+    if hasattr(arguments, "only_check"):
+        raise InputAccepted
     return write_answer(report, arguments.output, quiet=arguments.quiet)
 
 
@@ -246,7 +295,6 @@ def answer_morphospace(arguments: argparse.Namespace) -> Outcome:
 
 def answer_regress(arguments: argparse.Namespace) -> Outcome:
     """Fit a regression on shape, predict with it, and write the report."""
-    from shapespace.batch.progress import steps
     from shapespace.io.files import make_folder
     from shapespace.report.analyses.regression_report import (
         prediction_report,
@@ -277,7 +325,7 @@ def answer_regress(arguments: argparse.Namespace) -> Outcome:
         options = {name: value for name, value in options.items() if value is not None}
         compute = partial(predict_shapes, cohort, **options)
         return _compute_and_report(arguments, "flipping signs", "step", compute, shape_prediction_report)
-    with steps(None, "learning", "fold", quiet=arguments.quiet) as step:
+    with _steps(arguments, None, "learning", "fold") as step:
         result = regress(cohort, arguments.target, folds=arguments.folds, **shared, progress=step)
     new = None
     if arguments.predict is not None:

@@ -16,9 +16,9 @@ from shapespace.cli.options import Container, Option, apply_settings
 from shapespace.version import __version__
 
 
-def parser() -> argparse.ArgumentParser:
-    """Return the parser of all commands."""
-    top = CommandParser(
+def parser(kind: type[CommandParser] | None = None) -> argparse.ArgumentParser:
+    """Return the parser of all commands; `kind` is its class."""
+    top = (kind or CommandParser)(
         prog="shapespace",
         description="Statistical shape models from raw 3-D scans: correspondence, model building, robust fitting and "
         "shape statistics.",

@@ -482,8 +482,8 @@ COMMANDS: tuple[CommandSpec, ...] = (
         ("shapespace quality faces -o quality",
          "shapespace quality registered_a registered_b --scans scans -o quality"), "commands.quality:quality",
         (
-            basic("targets", "TARGET", "a folder of meshes in correspondence or a model; two are compared", nargs="+",
-                  parse=Path),
+            basic("targets", "TARGET", "a folder of meshes in correspondence, its meshes, or a model; two are compared",
+                  nargs="+", parse=Path),
             _OUTPUT,
             basic("--scans", "FOLDER", source=QUALITY_TARGETS),
             basic("--unseen", "FOLDER", source=QUALITY_TARGETS),

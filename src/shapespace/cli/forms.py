@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from shapespace.cli.answers import reason_of_rejection
 from shapespace.cli.options import Option
 from shapespace.formats.registry import MODEL_FORMATS
 from shapespace.io.landmarks.configuration_io import CONFIGURATION_FORMATS, FOLDER_FORMATS
@@ -119,10 +120,80 @@ _LABELS: Mapping[str, str] = {
     "regress --level": "Coverage of intervals",
 }  # fmt: skip
 """Option, without dashes and if need be after its command -> its label in the studio."""
+_HELPS: Mapping[str, str] = {
+    "build --additive": "path of a table in the project's folder with the columns file, subject and label, such as "
+    "labels.csv, with a neutral face of each subject; the number of modes then counts modes of identity",
+    "regress --at": "values of the number within the observed range, with commas, such as 25,30,40 (default: five "
+    "from the 5th to the 95th percentile)",
+    "morphospace --axes": "numbers of the axes drawn across and up, with a comma, such as 1,2",
+    "compare --bumps": "for fits: width (standard deviation, mm) of a bump along the normals that is also searched "
+    "for at each vertex, such as 5 (default: no search)",
+    "pls --columns": "columns of numbers, with commas, such as length,width; they are compared with shape",
+    "regress --covariates": "further columns of the linear model, such as sex + site; sex + age:sex adds their "
+    "interaction",
+    "crop": "part of the scan that is fitted, in its frame and unit: a sphere by its centre and radius, such as "
+    "sphere:0,20,0,60; a box by two corners, such as box:-50,-50,0,50,50,90; or all within a distance in mm of the "
+    "landmarks, such as landmarks:40",
+    "compare --error": "error term over whose mean square the F of a term is computed: the term and its error term, "
+    "such as genus=genus:species (default: the residuals)",
+    "convert --expressions": "path of the file of blendshapes of eos in the project's folder, such as blendshapes.bin",
+    "figures --format": "formats of the figures, with commas, such as svg,pdf,png",
+    "identify --gallery": "scans to enrol, by the classes of a column, such as expression=neutral or session=1,2; "
+    "session!=1,2 enrols all others (default: the first scan of each subject)",
+    "identify --probe": "scans to compare with the enrolled ones, by the classes of a column, such as "
+    "expression=smile (default: all that are neither enrolled nor used for training)",
+    "identify --train": "training scans, by the classes of a column, such as site=north (default: the scans of the "
+    "subjects in the other folds)",
+    "landmarks": "path of a table in the project's folder with the columns name and vertex, such as landmarks.csv "
+    "(default: the landmarks of the model or the correspondence)",
+    "correspond --landmarks": "path of a folder with a file of landmarks for each scan, named after it, such as marks",
+    "fit --landmarks": "path of a folder with a file of landmarks for each scan, named after it, such as marks; they "
+    "have the names of the model's landmarks (at least three)",
+    "complete --landmarks": "path of a folder with a file of landmarks for each scan, named after it, such as marks",
+    "regress --length": "for shapes along a number: two landmarks with a comma, such as nasion,gnathion, whose "
+    "distance is predicted too",
+    "build --licence": "licence of the meshes, kept in the model file, such as CC BY 4.0",
+    "equivalence --margin": "smallest Procrustes distance, in the unit of the data, of means that are not equivalent, "
+    "such as 0.02",
+    "equivalence --margin-sd": "margin in standard deviations within groups, the root of the pooled Procrustes "
+    "variance, such as 0.5",
+    "modules": "path of a table in the project's folder with the columns landmark (or vertex, from 0) and module, "
+    "such as modules.csv",
+    "change --order": "order of times that are words, the earliest first, with commas, such as before,after",
+    "trajectory --order": "classes of the points in their order, with commas, such as larva,juvenile,adult (default: "
+    "numbers ascending, others alphabetically)",
+    "asymmetry --pairs": "path of a table in the project's folder with two columns of landmarks that mirror each "
+    "other, such as pairs.csv: by name, or by number from 1; of surfaces also vertices from 0, those on the plane "
+    "paired with themselves (default: found on the mean)",
+    "complete --part": "region of the model that is estimated even where the scan shows it, such as jaw (default: "
+    "none)",
+    "build --provenance": "description of the meshes, kept in the model file, such as 40 skulls, micro-CT",
+    "region": "region of the surface: its name, and the path of a table of its vertices in the project's folder, such "
+    "as jaw=jaw.csv",
+    "fit --region": "region to which the fit, its distances and its status are restricted: its name in the model, "
+    "such as jaw, or the path of a table of vertices",
+    "quality --scans": "path of the folder of the scans that the surfaces were made from, with the same names, pose "
+    "and unit, such as scans; distances are measured to these",
+    "identify --scores": "scores, with commas, such as plda,cosine; the choices are plda, cosine, mahalanobis and "
+    "distance, and the summary reports the first (default: all)",
+    "power --sizes": "numbers of shapes in each group, with commas, such as 10,20,40",
+    "change --stable": "part that did not change, by which visits are aligned: auto (found), all, a region of the "
+    "model, the path of a table of vertices, such as skull.csv, or all within a distance in mm of landmarks, such as "
+    "landmarks:nasion,sella,20",
+    "tree": "path of a Newick or Nexus file in the project's folder, such as tree.nwk, whose tips have the names of "
+    "the specimens",
+    "quality --unseen": "path of a folder of corresponding shapes that no model was trained on, such as unseen; the "
+    "error on these is measured too",
+    "figures --views": "names of the views to draw, with commas, such as dorsal,lateral (default: all views)",
+    "score --reference": "class that the others are compared with",
+    "hold": "for shapes along a number: class of another column for which they are predicted",
+}
+"""Option, named as for its label -> help of an option whose help on the command line is about files or the terminal."""
 
 
 def forms(commands: Mapping[str, tuple[str, Sequence[Option]]]) -> dict[str, dict[str, Any]]:
-    """Return kind -> the words, label and summary of its command, and the options of its form.
+    """Return kind -> the words, label and summary of its command, the options of its form, and of a question the
+    function that checks its input.
 
     Args:
         commands: name -> summary and options, of all commands.
@@ -132,7 +203,7 @@ def forms(commands: Mapping[str, tuple[str, Sequence[Option]]]) -> dict[str, dic
         command = _KINDS.get(kind, kind)
         made[kind] = {
             "command": tuple(command.split()), "label": _ACTIONS[kind], "is_question": kind in _QUESTIONS,
-            **_make_form(kind, *commands[command], first)
+            **_make_form(kind, *commands[command], first), "check": reason_of_rejection
         }  # fmt: skip
     # Other options of this command change the unit or the side, which are set for each specimen.
     made["groom"]["options"] = [option for option in made["groom"]["options"] if option["visible"]]
@@ -141,9 +212,7 @@ def forms(commands: Mapping[str, tuple[str, Sequence[Option]]]) -> dict[str, dic
         "kind": "choice", "choices": [*CONFIGURATION_FORMATS, *FOLDER_FORMATS], "initial": "csv",
         "help": "csv has a row for each specimen, long a row for each landmark; the last two are of 3D Slicer",
     }  # fmt: skip
-    made["score"]["options"][0] |= {"kind": "class", "help": "class that the others are compared with"}
-    hold = next(option for option in made["regress"]["options"] if option["label"] == _LABELS["hold"])
-    hold["help"] = "with --along: class of another column for which shapes are predicted"
+    made["score"]["options"][0]["kind"] = "class"
     return made
 
 
@@ -167,9 +236,10 @@ def _describe_option(kind: str, option: Option, *, visible: bool) -> dict[str, A
     choices = list(option.accepted) or (["yes", "no"] if option.value_name == "yes|no" else [])
     flag = _page_name(option)
     argument = f"--set {option.names}" if option.setting else "" if option.is_positional else option.spellings[-1]
+    plain = _HELPS.get(f"{kind} {flag}") or _HELPS.get(flag[2:])
     return {
         "flag": flag, "argument": argument, "label": _LABELS.get(f"{kind} {flag}", _LABELS[flag[2:]]),
-        "help": option.text.replace("`", ""), "kind": "choice" if choices else _kind(option),
+        "help": plain or option.text.replace("`", ""), "kind": "choice" if choices else _kind(option),
         "choices": choices, "initial": option.initial_text or None, "visible": visible,
         "required": (option.required and not option.either) or option.names in ("formula", "--to"),
     }  # fmt: skip

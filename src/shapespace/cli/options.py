@@ -170,7 +170,8 @@ class Option:
         if self.is_flag or initial in (NO_DEFAULT, None, "", (), []):
             return ""
         words = cast(Sequence[Any], initial) if isinstance(initial, tuple) else (initial,)
-        return " ".join({True: "yes", False: "no"}[word] if isinstance(word, bool) else str(word) for word in words)
+        texts = ({True: "yes", False: "no"}[word] if isinstance(word, bool) else str(word) for word in words)
+        return (" " if self.nargs else ",").join(texts)
 
     @property
     def _field(self) -> Field | None:

@@ -107,7 +107,7 @@ def quality(
     """Measure one target or two, and write `quality.json` and the curves.
 
     Args:
-        targets: models, or folders of meshes in correspondence.
+        targets: models, or folders of meshes in correspondence; all meshes that are given are one target.
         output: the folder to write to.
         config: folds, modes, samples, seed and gauge.
         options: measures and the data that they need.
@@ -165,22 +165,24 @@ def _load_targets(
     paths: Sequence[Path], config: QualityConfig, options: QualityOptions, notes: list[str], *, quiet: bool
 ) -> list[_QualityInput]:
     names = list(options.representations)
-    if len(paths) > _MOST_TARGETS or len(names) > _MOST_TARGETS:
+    meshes = [path for path in paths if path.is_file() and not looks_like_model(path)]
+    targets = [*([path] for path in paths if path not in meshes), *([meshes] if meshes else [])]
+    if len(targets) > _MOST_TARGETS or len(names) > _MOST_TARGETS:
         raise InputError("At most two targets or representations are compared; give one or two.")
     gauge = config.gauge if config.align else "form"
     loaded: list[tuple[ShapeModel | list[Mesh], dict[str, float]]] = [
-        (ShapeModel.load(p), {})
-        if not p.is_dir() and looks_like_model(p)
-        else _read_meshes(p, notes, gauge, options, quiet=quiet)
-        for p in paths
+        (ShapeModel.load(target[0]), {})
+        if not target[0].is_dir() and looks_like_model(target[0])
+        else _read_meshes(target, notes, gauge, options, quiet=quiet)
+        for target in targets
     ]
-    pairs = [(k, names[min(k, len(names) - 1)]) for k in range(len(paths))]
-    if len(paths) == 1 and len(names) == _MOST_TARGETS:
+    pairs = [(k, names[min(k, len(names) - 1)]) for k in range(len(targets))]
+    if len(targets) == 1 and len(names) == _MOST_TARGETS:
         pairs = [(0, name) for name in names]
     several = len({name for _, name in pairs}) > 1
     out: list[_QualityInput] = []
     for k, name in pairs:
-        called = f"{paths[k]}, {name}" if several else str(paths[k])
+        called = f"{_name(targets[k])}, {name}" if several else _name(targets[k])
         out.append(_QualityInput(called, loaded[k][0], _config_of_representation(config, name, names), loaded[k][1]))
     if len(out) == _MOST_TARGETS and not any(isinstance(target.data, ShapeModel) for target in out):
         _check_same_shapes(out)
@@ -204,13 +206,17 @@ def _check_same_shapes(targets: Sequence[_QualityInput]) -> None:
         )
 
 
+def _name(target: Sequence[Path]) -> str:
+    return str(target[0]) if len(target) == 1 else f"{len(target)} meshes of {target[0].parent}"
+
+
 def _read_meshes(
-    folder: Path, notes: list[str], gauge: Gauge, options: QualityOptions, *, quiet: bool
+    target: Sequence[Path], notes: list[str], gauge: Gauge, options: QualityOptions, *, quiet: bool
 ) -> tuple[list[Mesh], dict[str, float]]:
-    """Return the meshes of a folder in the unit of most meshes, and the unit ratios of the others."""
-    listed, review = reviewed_surfaces([folder], "--with-doubtful", with_doubtful=options.with_doubtful)
+    """Return the meshes of a target in the unit of most meshes, and the unit ratios of the others."""
+    listed, review = reviewed_surfaces(target, "--with-doubtful", with_doubtful=options.with_doubtful)
     if summary := review_summary(review):
-        notes.append(f"{folder}: {summary}.")
+        notes.append(f"{_name(target)}: {summary}.")
     notes += listed.notes
     if gauge == "form":
         listed.refuse_mixed_units()
@@ -220,7 +226,8 @@ def _read_meshes(
     for ending in _SURFACES:
         if surfaces := [file for file in files if file.name.endswith(ending)]:
             if len(surfaces) < len(files):
-                notes.append(f"{folder}: of {len(files)} meshes the {len(surfaces)} that end in {ending} are taken.")
+                count = len(surfaces)
+                notes.append(f"{_name(target)}: of {len(files)} meshes the {count} that end in {ending} are taken.")
             files = surfaces
             break
     meshes = SurfacesOnDisk(files, listed).read(quiet=quiet)
@@ -252,7 +259,7 @@ def _read_scans(target: _QualityInput, folder: Path | None, *, quiet: bool) -> l
 
 
 def _measure(target: _QualityInput, options: QualityOptions, run: Runner, *, quiet: bool) -> ModelQuality:
-    unseen = [] if options.unseen is None else _read_meshes(options.unseen, [], "shape", options, quiet=quiet)[0]
+    unseen = [] if options.unseen is None else _read_meshes([options.unseen], [], "shape", options, quiet=quiet)[0]
     scans = _read_scans(target, options.scans, quiet=quiet)
     with steps(None, f"measuring {target.name}, in", "step", quiet=quiet) as step:
         return measure_quality(target.data, target.config, scans=scans, unseen=unseen, progress=step, run=run)

@@ -85,6 +85,8 @@ def change(
             f"{cohort.table.where}: none of its {len(single)} subjects has two visits ({list_names(single)}); give the "
             f"same subject in {config.subject} and another time in {visits.column}."
         )
+    if config.rate and not visits.time_unit:
+        raise InputError("Rates need times that are numbers or dates; remove --rate, or name such a --time.")
     groups = _groups(cohort, config, visits, single)
     stable = stable_vertices(cohort, config.stable)
     regions = _regions(cohort, config)
@@ -358,8 +360,6 @@ def _blank(subjects: Sequence[SubjectChange]) -> BoolArray:
 def _add_tests(result: ChangeResult, groups: Mapping[str, str]) -> ChangeResult:
     """Return a result with its tests over subjects."""
     config, subjects = result.config, result.subjects
-    if config.rate and not result.time_unit:
-        raise InputError("Rates need times that are numbers or dates; remove --rate, or name such a --time.")
     if len(subjects) < 2:
         return result
     estimates = [change_or_rate(subject, rate=config.rate) for subject in subjects]

@@ -61,6 +61,10 @@ class ScoreConfig:
     seed: int = 0
     drop_missing: bool = False
 
+    def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise InputError("The seed must be 0 or more.")
+
 
 @dataclass(frozen=True, eq=False)
 class NearestReference:
@@ -241,6 +245,8 @@ def _score_shapes(
     people = _people(reference, config.subject)
     own, outside_basis = _in_basis_of(reference, subjects)
     _check_not_in_reference(reference, subjects, own, outside_basis, config.subject)
+    if progress is not None:
+        progress(0, len(subjects))
     population = _Population(reference, people, modes)
     theirs, ours = _FitUncertainty.of(reference), _FitUncertainty.of(subjects)
     notes = [*reference.notes, *(note for note in subjects.notes if note not in reference.notes)]

@@ -50,6 +50,7 @@ Rows = tuple[Sequence[str], Sequence[Sequence[object]]]
 """The header of a table, and its rows."""
 
 
+_EQUAL = 1e-9  # relative range of values that differ by rounding only, which cannot be divided into bins
 METHODS_FILE = "methods.txt"
 """A paragraph for the methods section of a paper, with references."""
 REDUCED_MORPH_NOTE = "Drawn smaller than it is, so that no triangle flips."
@@ -139,7 +140,10 @@ def histogram_part(
         shares: shares of each set instead of counts.
         **known: further fields of the part.
     """
-    edges = np.histogram_bin_edges(np.concatenate(list(values.values())), bins)
+    every = np.concatenate(list(values.values()))
+    if every.size and np.ptp(every) <= _EQUAL * np.abs(every).max():
+        every = every[:1]
+    edges = np.histogram_bin_edges(every, bins)
     counts = {label: np.histogram(own, edges)[0] / (len(own) if shares else 1) for label, own in values.items()}
     series = tuple(Counts(counts=floats(own), label=label) for label, own in counts.items())
     return HistogramPart(title=title, edges=floats(edges), series=series, **known)

@@ -248,12 +248,12 @@
   };
 
   /** Jobs that other screens show: those that run or wait, and the newest one of a kind if it failed. */
-  const Elsewhere = ({ kinds }) => {
+  const Elsewhere = ({ kinds, testid = "elsewhere" }) => {
     const newest = new Map(Studio.state.project.jobs.map((job) => [job.kind, job]));
     const shown = Studio.state.project.jobs.filter((job) => !kinds.includes(job.kind) && (Studio.isActive(job) || ((job.status === "failed" || job.partly) && newest.get(job.kind) === job)));
-    return shown.length > 0 && html`<div class="elsewhere" data-testid="elsewhere">${shown.map((job) => html`<p key=${job.number} class=${job.status} data-testid=${`elsewhere-${job.number}`}>
+    return shown.length > 0 && html`<div class="elsewhere" data-testid=${testid}>${shown.map((job) => html`<p key=${job.number} class=${job.status} data-testid=${`elsewhere-${job.number}`}>
       <strong>${kindOf(job)}</strong> <span class="hint">${J.statuses[job.status]}${job.progress ? `, ${J.progress(job.progress)}` : job.status === "failed" || job.partly ? `: ${job.message}` : ""}</span>
-      ${Studio.isActive(job) && html`<${Button} edits small testid=${`elsewhere-cancel-${job.number}`} onclick=${() => Studio.act(`/api/jobs/${job.number}/cancel`)}>${J.cancel}<//>`}</p>`)}</div>`;
+      ${Studio.isActive(job) && html` <${Button} edits small testid=${`elsewhere-cancel-${job.number}`} onclick=${() => Studio.act(`/api/jobs/${job.number}/cancel`)}>${J.cancel}<//>`}</p>`)}</div>`;
   };
 
   Object.assign(Studio, { Elsewhere, Outdated, duration, action, kindOf, JobForm, JobPanel, Result, Settings, Jobs, useResult });

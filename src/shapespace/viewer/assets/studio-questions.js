@@ -6,7 +6,7 @@
   const Studio = window.ShapespaceStudio;
   const T = window.ShapespaceTexts;
   const Q = T.questions;
-  const { Button, CopyButton, JobForm, Jobs, Settings, Step, useResult } = Studio;
+  const { Button, CopyButton, Elsewhere, JobForm, Jobs, Settings, Step, useResult } = Studio;
   const KINDS = []; // filled when the forms are known
   const CORRESPONDENCES = ["correspond", "redo"];
   const SOURCES = { identify: ["fit"] }; // others also take surfaces in correspondence
@@ -15,6 +15,9 @@
   const hint = (kind) => Q.hints[kind] || `${Studio.forms[kind].summary[0].toUpperCase()}${Studio.forms[kind].summary.slice(1)}.`;
 
   Studio.QUESTIONS = KINDS;
+
+  /** Questions other than `kind` that run or wait, or failed last: the strip above the screen has those of other screens. */
+  const Others = ({ kind }) => html`<${Elsewhere} testid="other-questions" kinds=${Studio.state.project.jobs.map((job) => job.kind).filter((one) => one === kind || !KINDS.includes(one))} />`;
 
   const Answer = ({ job }) => html`
     <div class="answer" data-testid="answer">
@@ -31,6 +34,7 @@
       <h2>${Studio.action(kind)}</h2>
       <p class="hint">${ready ? hint(kind) : Q.none}</p>
       <${Jobs} kinds=${[kind]} />
+      <${Others} kind=${kind} />
       ${job && html`<${Button} class="wide" strong=${!busy} testid="next" onclick=${next}>${T.next.questions}<//>`}
       <${Settings} key="settings" kinds=${[kind]}><${JobForm} kind=${kind} sources=${sources(kind)} strong=${!job && !busy} checked disabled=${!ready || busy} /><//>`;
     return html`<${Step} name="question" title=${Studio.action(kind)} controls=${controls} select=${select} job=${job} empty=${Q.empty}>${job && html`<${Answer} job=${job} />`}<//>`;
@@ -45,6 +49,7 @@
       <div class="fill scroll" data-testid="screen-questions">
         <div class="row bar"><h2>${Q.title}</h2><span class="grow"></span>
           ${earlier.some((job) => job.status === "done") && html`<${Button} strong testid="next" onclick=${next}>${T.next.questions}<//>`}</div>
+        <${Others} />
         <ul class="questions">
           ${KINDS.filter((one) => Studio.forms[one] && !Studio.state.read_only).map((one) => html`<li key=${one}><button type="button" data-testid=${`question-${one}`} onclick=${() => ask(one)}><strong>${Studio.action(one)}</strong><span class="hint">${hint(one)}</span></button></li>`)}
         </ul>

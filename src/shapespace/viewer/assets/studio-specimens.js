@@ -57,7 +57,7 @@
         <button type="button" class="picture" aria-pressed=${selected} data-testid=${`select-${specimen.id}`} onclick=${(event) => onselect(specimen.id, event)}>
           <span class="hidden">${S.selectOne(specimen.id)}</span>
           ${specimen.state === "ready"
-            ? html`<img class=${specimen.mirrored ? "mirrored" : ""} src=${`/api/thumbnails/${encodeURIComponent(specimen.id)}`} alt="" loading="lazy" />`
+            ? html`<img class=${specimen.mirrored ? "mirrored" : ""} src=${`/api/thumbnails/${encodeURIComponent(specimen.id)}?scan=${specimen.scan}`} alt="" loading="lazy" />`
             : html`<span>${S.states[specimen.state]}</span>`}
         </button>
         <div class="row"><${Studio.Include} specimen=${specimen} /><strong title=${specimen.id}>${specimen.id}</strong><${Studio.ShowScan} specimen=${specimen} /></div>
@@ -134,11 +134,14 @@
     const { columns } = Studio.state.project;
     const [column, setColumn] = useState(columns[0] || S.groupColumn);
     const [value, setValue] = useState("");
+    const seen = useRef(Studio.state.project.specimens); // the cells that the user saw; another tab may change them in the meantime
     const save = async (event) => {
       event.preventDefault();
       const name = column.trim();
+      const before = Object.fromEntries(seen.current.map((one) => [one.id, one.cells[name] || ""]));
       const isThere = columns.includes(name) || (await Studio.edit({ what: "add-column", column: name }));
-      if (isThere && (await Studio.edit({ what: "cells", cells: ids.map((id) => ({ id, column: name, value })) }))) onclose();
+      if (isThere && (await Studio.edit({ what: "cells", cells: ids.map((id) => ({ id, column: name, value, before: before[id] })) }))) onclose();
+      else seen.current = Studio.state.project.specimens;
     };
     return html`
       <form class="row inline" data-testid="group-form" onsubmit=${save}>

@@ -75,6 +75,9 @@
     for (const key of ["columns", "point_names"]) if (JSON.stringify(before[key]) === JSON.stringify(state.project[key])) state.project[key] = before[key];
   }
 
+  // Scans may have been replaced in another program, which sends no event.
+  addEventListener("focus", () => { if (Studio.state) refresh().catch(() => {}); });
+
   function listen() {
     const events = new EventSource("/api/events");
     const offline = document.getElementById("offline");

@@ -104,7 +104,7 @@
       title: (number, name) => `${number}: ${name}`,
       sameSettings: "Run again with the same settings", isOutdated: "outdated",
       outdated: {
-        specimens: "Made before specimens were changed, excluded or included.", table: "Made before the table was changed.", landmarks: "Made before the landmarks were changed.",
+        specimens: "Made before specimens were changed, excluded or included, or a scan was replaced.", table: "Made before the table was changed.", landmarks: "Made before the landmarks were changed.",
         redone: "Made before a scan was registered again.", source: "Made from a result that is outdated; run that one again first.",
       }, source: "Made from", newest: "newest result",
       progress: ({ doing, done, total }) => total ? `${doing} (${done} of ${total})` : doing, progressLabel: (kind) => `Progress of: ${kind}`,

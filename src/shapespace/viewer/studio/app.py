@@ -144,9 +144,10 @@ class OpenProject:
         """Return the state for the page."""
         jobs, project = self.jobs.all(), self.project  # in this order: a job that is done has changed the state
         state = project.state
-        key = (state, [(job.number, job.status) for job in jobs])
+        scans = project.scan_keys(state.specimens)
+        key = (state, scans, [(job.number, job.status) for job in jobs])
         if key != self._outdated[0]:
-            self._outdated = key, outdated_results(project, jobs, self._forms)
+            self._outdated = key, outdated_results(project, jobs, self._forms, scans)
         specimens: list[dict[str, Any]] = []
         for specimen in state.specimens:
             facts = self.checks.facts(project.path(specimen)) or {
@@ -155,7 +156,7 @@ class OpenProject:
             specimens.append({
                 "id": specimen.id, "file": specimen.file, "set": specimen.role, "included": specimen.included,
                 "unit": specimen.unit, "mirrored": specimen.mirrored, "groomed": bool(specimen.original),
-                "cells": specimen.cells, "points": specimen.points,
+                "cells": specimen.cells, "points": specimen.points, "scan": scans[specimen.id],
                 **{key: fact for key, fact in facts.items() if key != "profile"},
                 "findings": [{**finding, "text": self._sentence(finding["text"])} for finding in facts["findings"]],
             })  # fmt: skip
@@ -467,7 +468,8 @@ class Studio:
         opened = self._project
 
         def make(number: int, before: list[Job]) -> Order:
-            return order(opened.project, before, self._forms, kind, cast(dict[str, Any], options), on, number)
+            scans = opened.project.scan_keys(opened.project.state.specimens)
+            return order(opened.project, before, self._forms, kind, cast(dict[str, Any], options), on, number, scans)
 
         job = await run_in_threadpool(opened.jobs.add, kind, make, cast(dict[str, Any], options))
         return json_response({"number": job.number}, 201)

@@ -5,30 +5,40 @@ from __future__ import annotations
 
 import csv
 import io
+import os
 import re
-from collections.abc import Collection, Mapping, Sequence
+import shutil
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal, cast
+
+import numpy as np
 
 from shapespace.batch.result_folder import names_for
 from shapespace.cohort.read import cohort_file_text
-from shapespace.cohort.table import Table, is_number, list_names
+from shapespace.cohort.table import is_number, list_names
 from shapespace.errors import FileError, InputError, ShapespaceError
+from shapespace.io.files import make_folder
 from shapespace.io.landmarks.configuration_io import CONFIGURATION_FORMATS
+from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.io.tables.table_io import DECIMAL_COMMA
 from shapespace.io.volume_io import VOLUME_ENDINGS
 from shapespace.model.shape_model import ShapeModel
-from shapespace.schemas import CorrespondRecord
-from shapespace.statistics.compare_formula import design_of
+from shapespace.schemas import CorrespondenceRecord, CorrespondRecord
 from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS
+from shapespace.store.results import Results
+from shapespace.types import Mesh
 from shapespace.viewer.studio.jobs import Job, Order
 from shapespace.viewer.studio.project import LANDMARK_COLUMN, Project, Specimen
 
 Forms = Mapping[str, Mapping[str, Any]]
-"""Kind -> `command` (its words), `label`, `summary`, and `options`, each with `flag`, `argument`, `label`, `help`,
-`kind`, `choices`, `initial`, `visible` and `required`; `argument` is `--set NAME` for a setting, and empty for a
-positional argument."""
+"""Kind -> `command` (its words), `label`, `summary`, `is_question`, `check`, a function of the arguments and of folders
+that returns why the command of a question would reject its input, and `options`, each with `flag`, `argument`,
+`label`, `help`, `kind`, `choices`, `initial`, `visible` and `required`; `argument` is `--set NAME` for a setting, and
+empty for a positional argument."""
 
 QUESTIONS = (
     "compare", "change", "asymmetry", "regress", "score", "identify", *(test.name for test in SHAPE_TESTS),
@@ -41,6 +51,9 @@ _INPUTS = "inputs"
 _NAMES = ("name", "files", "ids", "set")
 """Keys of the options of a job that name scans or volumes; all others are options of its command."""
 _MOST_ODD = 5  # findings on single specimens in the checks
+_LEAST_WAYS = 60  # in which small surfaces of a check vary; few, so that the check of many specimens takes no time
+_OF_SURFACES = ("--geometry", "--landmarks", "--length", "--modules", "--pairs", "--region", "--stable")
+"""Options that depend on the vertices of surfaces, so that small ones cannot stand for them in a check."""
 _TERMINAL_NOTES = re.compile(
     r" \([^()]*(?:NAME\.|MODEL\.h5|about\.json)[^()]*\)|; exit with \d [^.;]*|(?m:^(?:next|usage): .*\n?)"
 )
@@ -71,7 +84,10 @@ class OptionLabels:
         self._action = re.compile(rf"(?:\bshapespace ({names})\b(?! \S+ -\w\b)|\b({names})(?= --))( (?=--))?")
 
         self.forms = {
-            kind: {**form, "options": [{**option, "help": self.sentence(option["help"])} for option in form["options"]]}
+            kind: {
+                "options": [{**option, "help": self.sentence(option["help"])} for option in form["options"]],
+                **{name: form[name] for name in ("command", "label", "is_question", "summary")},
+            }
             for kind, form in forms.items()
         }
 
@@ -101,7 +117,7 @@ class OptionLabels:
 
 def order(
     project: Project, jobs: Sequence[Job], forms: Forms, kind: str, options: Mapping[str, Any], on: int | None,
-    number: int,
+    number: int, scans: Mapping[str, str] = {},
 ) -> Order:  # fmt: skip
     """Return the command of a new job, with the files that it reads.
 
@@ -113,6 +129,7 @@ def order(
         options: flag -> value, as sent by the page.
         on: number of the job whose result it uses; None for the newest that succeeded.
         number: number of the new job.
+        scans: id of each specimen -> key of its scan, for the record of the scans that are read.
 
     Raises:
         InputError: it cannot be run: no such kind or option, or a result or specimens are missing.
@@ -125,7 +142,8 @@ def order(
         chosen = _require_specimens(state.chosen("training"), "to bring into correspondence", 2)
         files, prepared = project.scan_list(folder / listed, chosen)
         output = f"correspondence-{number}"
-        return Order((*words, listed, "-o", output, *given), output, prepared, files=files)
+        keys = _keys_of(chosen, scans)
+        return Order((*words, listed, "-o", output, *given), output, prepared, files=files, scans=keys)
     if kind == "redo":
         before = result_of(jobs, CORRESPONDENCES, on)
         name = str(options.get("name", ""))
@@ -133,7 +151,9 @@ def order(
         if not chosen:
             raise InputError(f"There is no specimen {name[:40]!r}; choose one of the list.")
         files, prepared = project.scan_list(folder / listed, chosen)
-        return Order((*words, listed, "--redo", name, "-o", before.output), before.output, prepared, files=files)
+        keys = _keys_of(chosen, scans)
+        redone = (*words, listed, "--redo", name, "-o", before.output)
+        return Order(redone, before.output, prepared, files=files, scans=keys)
     if kind == "surface":
         output = f"surfaces/{number:04d}"
         return Order((*words, *stored_volumes(project, options.get("files")), "-o", output, *given), output)
@@ -158,7 +178,8 @@ def order(
         return Order((*words, *_surfaces(project, before), "-o", output, *marks, *given), output, files=files)
     if kind == "quality":
         output = f"quality-{number}"
-        return Order((*words, result_of(jobs, CORRESPONDENCES, on).output, "-o", output, *given), output)
+        surfaces = _surfaces(project, result_of(jobs, CORRESPONDENCES, on))
+        return Order((*words, *surfaces, "-o", output, *given), output)
     if kind in ("fit", "complete"):
         model = result_of(jobs, ("build",), on).output
         chosen = _require_specimens(state.chosen("new"), "to fit; drop new scans", 1)
@@ -166,13 +187,14 @@ def order(
         names = _landmark_names(path, path.stat().st_mtime if path.is_file() else 0.0) if has_points else ()
         files, prepared = project.scan_list(folder / listed, chosen, names)
         output = f"{'fits' if kind == 'fit' else 'completed'}-{number}"
-        return Order((*words, model, listed, "-o", output, *given), output, prepared, files=files)
+        keys = _keys_of(chosen, scans)
+        return Order((*words, model, listed, "-o", output, *given), output, prepared, files=files, scans=keys)
     if kind == "landmarks":
         return _export_landmarks(project, words, given, str(options.get("--to", "")), number)
     if kind == "report" and on is None:
         output = f"report-{number}/report.html"
         results = [job.output for job in _results_of_study(jobs)]
-        files = {listed: project.table(state.specimens)}
+        files = {listed: project.table(specimen for specimen in state.specimens if specimen.included)}
         return Order((*words, *results, "--specimens", listed, "-o", output, "--no-open", *given), output, files=files)
     if kind == "report":
         before = result_of(jobs, (*CORRESPONDENCES, "fit"), on)
@@ -185,11 +207,15 @@ def order(
         output = f"exported-{number}{_model_ending(to)}"
         return Order((*words, model, output, *given), output)
     if kind == "export":
-        output = f"exported-{number}"
-        return Order((*words, result_of(jobs, ("fit",), on).output, "--all", "-o", output, *given), output)
+        output, fits = f"exported-{number}", result_of(jobs, ("fit",), on).output
+        excluded = {specimen.id for specimen in state.specimens if not specimen.included and specimen.role == "new"}
+        names = [name for name in Results(folder / fits).names() if name not in excluded] if excluded else ["--all"]
+        if not names:
+            raise InputError(f"All specimens of {fits} are excluded; include one.")
+        return Order((*words, fits, *names, "-o", output, *given), output)
     if kind not in QUESTIONS:
         raise InputError(f"There is no action {kind[:30]!r}; reload the page.")
-    return _question(project, jobs, kind, words, given, options, on, number)
+    return _question(project, shapes_of(jobs, kind, on), forms, kind, options, number)
 
 
 def _export_landmarks(project: Project, words: tuple[str, ...], given: Sequence[str], to: str, number: int) -> Order:
@@ -245,12 +271,9 @@ def groomed_scans(job: Job, folder: Path) -> dict[str, str]:
     return {scan: path for scan, path in paths.items() if (folder / path).is_file()}
 
 
-def _question(
-    project: Project, jobs: Sequence[Job], kind: str, words: tuple[str, ...], given: Sequence[str],
-    options: Mapping[str, Any], on: int | None, number: int,
-) -> Order:  # fmt: skip
+def _question(project: Project, shapes: Job, forms: Forms, kind: str, options: Mapping[str, Any], number: int) -> Order:
+    words, given = forms[kind]["command"], _option_arguments(forms, kind, options)
     stem, output = f"{_INPUTS}/{number:04d}", f"{kind}-{number}"
-    shapes = shapes_of(jobs, kind, on)
     chosen = _specimens_of(project, shapes)
     if kind == "score":
         reference, others = _by_class(chosen, options.get("--reference"))
@@ -393,7 +416,6 @@ def checks(
             found.append({"level": "ok", "text": f"{column}: {len(classes)} values."})
         if len(classes) == 1:
             found.append({"level": "problem", "text": f"{column} has one value for all specimens; nothing can differ."})
-    are_known = not any(missing.values()) or drop_missing
     for option in forms.get(kind, {}).get("options", ()):
         value = str(options.get(option["flag"]) or "").strip()
         text = ""
@@ -401,29 +423,66 @@ def checks(
             text = f"Choose a value of {option['flag']}."
         elif value and option["kind"] == "number" and not is_number(value):
             text = f"{option['flag']}: {value[:40]!r} is not a number."
-        elif value and option["kind"] == "formula" and are_known and len(chosen) >= 2:
-            text = _problem_of_formula(value, project.state.columns, chosen)
-        elif (
-            value in columns
-            and option["flag"] in ("--group", "--points")
-            and len(chosen) == len({specimen.cells.get(value) for specimen in chosen})
-        ):
-            text = f"{value} has another value for each specimen; choose a column of classes."
         if text:
             found.append({"level": "problem", "text": text})
+    if not any(finding["level"] == "problem" for finding in found):
+        reason = _reason_of_rejection(project, forms, kind, options, shapes, [specimen.id for specimen in chosen])
+        for column in columns if reason else ():
+            is_group = column in (options.get("--group"), options.get("--points"))
+            if is_group and len(chosen) == len({specimen.cells.get(column) for specimen in chosen}):
+                reason = f"{column} has another value for each specimen; choose a column of classes."
+        found += [{"level": "problem", "text": reason}] if reason else []
     return found
 
 
-def _problem_of_formula(formula: str, columns: Sequence[str], specimens: Sequence[Specimen]) -> str:
-    """Return why a formula cannot be used for specimens whose named cells are known; empty if it can."""
-    cells = {column: tuple(specimen.cells.get(column, "") for specimen in specimens) for column in columns}
-    sizes = tuple(str(1 + k) for k in range(len(specimens)))  # any numbers: the sizes of shapes are not known yet
-    table = Table({"log_size": sizes, **cells}, tuple(specimen.id for specimen in specimens), "The table")
-    try:
-        design_of(formula, table)
-    except ShapespaceError as error:
-        return str(error)
-    return ""
+def _reason_of_rejection(
+    project: Project, forms: Forms, kind: str, options: Mapping[str, Any], shapes: Job | None, names: Sequence[str]
+) -> str:
+    """Return why the command of a question would reject its input; empty if it would not, or cannot be asked.
+
+    It is asked with the table, options and fits of the project, and small surfaces of the same names in place of those
+    in correspondence, which would take too long to read.
+    """
+    shapes = shapes or Job(number=0, kind="correspond", arguments=(), output="shapes")
+    if kind == "power" and re.fullmatch(r"corrected|[\d.]+x", str(options.get("--effect") or "corrected")):
+        options = {**options, "--effect": "observed"}  # whether there is such an effect depends on the real surfaces
+    with TemporaryDirectory(prefix="shapespace-check-", ignore_cleanup_errors=True) as name:
+        folder = Path(name)
+        try:
+            made = _question(project, shapes, forms, kind, options, 0)
+            made.write_files(folder)
+            if shapes.kind == "fit":
+                (folder / shapes.output).symlink_to(project.folder / shapes.output)
+            else:
+                ways = [int(options[flag]) for flag in ("--components", "--modes") if str(options.get(flag)).isdigit()]
+                _write_small_surfaces(project, shapes, names, folder, max(_LEAST_WAYS, *ways, 0))
+        except InputError as error:
+            return str(error)
+        except OSError:
+            return ""  # Windows does not allow links to all users
+        way = ["--set", "surfaces=coefficients"] if shapes.kind == "fit" else []
+        is_parsed_only = any(options.get(flag) for flag in _OF_SURFACES)
+        folders = [] if is_parsed_only else [folder, project.folder]
+        reason = str(forms[kind]["check"]([*made.arguments, *way], folders))
+        reason = reason.replace(str(folder / next(iter(made.files))), "The table")
+        return reason.replace(f"{folder}{os.sep}", "").replace(f"{project.folder}{os.sep}", "")
+
+
+def _write_small_surfaces(project: Project, shapes: Job, names: Sequence[str], folder: Path, ways: int) -> None:
+    """Write small symmetric surfaces, which vary in `ways` ways, into `folder`: for each name that has one in `shapes`,
+    or all if `shapes` has no folder, with its record."""
+    rng = np.random.default_rng(0)
+    half = rng.normal([4.0, 0.0, 0.0], size=(min(ways, len(names)) // 6 + 6, 3))
+    template = np.concatenate([half, half * (-1.0, 1.0, 1.0)])
+    triangles = np.arange(len(half) - 2)[:, None] + np.arange(3)
+    faces = np.concatenate([triangles, triangles[:, ::-1] + len(half)]).astype(np.int32)
+    source, target = project.folder / shapes.output, make_folder(folder / shapes.output)
+    for name in names:
+        if not source.is_dir() or (source / f"{name}{CorrespondRecord.SURFACE}").is_file():
+            vertices = template + 0.1 * rng.normal(size=template.shape)
+            write_mesh(target / f"{name}{CorrespondRecord.SURFACE}", Mesh(vertices, faces))
+    if (source / CorrespondenceRecord.FILE).is_file():
+        shutil.copyfile(source / CorrespondenceRecord.FILE, target / CorrespondenceRecord.FILE)
 
 
 Outdated = Literal["specimens", "table", "landmarks", "redone", "source"]
@@ -431,33 +490,45 @@ Outdated = Literal["specimens", "table", "landmarks", "redone", "source"]
 landmarks, the correspondence, in which a scan was registered again, or a result that it was computed from."""
 
 
-def outdated_results(project: Project, jobs: Sequence[Job], forms: Forms) -> dict[int, Outdated]:
+def outdated_results(
+    project: Project, jobs: Sequence[Job], forms: Forms, scans: Mapping[str, str] = {}
+) -> dict[int, Outdated]:
     """Return what changed since results were computed, by the numbers of their jobs; other results are up to date.
 
     A result is up to date if the command for the same choices, with the same source, and the files that it would read
-    are those of its job; of tables only the columns count that it uses.
+    are those of its job; of tables only the columns count that it uses. `scans` has the present key of the scan of each
+    specimen by its id.
     """
     found: dict[int, Outdated] = {}
+    present = _keys_of([specimen for specimen in project.state.specimens if specimen.included], scans)
     done = [job for job in jobs if job.status == "done"]
+    paths = {job.number: job.paths for job in done}
     for job in done:
         earlier = [other for other in done if other.number < job.number]
-        sources = [other for other in earlier if _reads(job, other.output)]
-        redone = [other.output for other in done if other.kind == "redo" and other.number > job.number]
-        if (
-            job.kind in (*_STUDY, "report", "landmarks")
+        sources = [other for other in earlier if other.output in paths[job.number]]
+        redone = [other for other in done if other.kind == "redo" and other.number > job.number]
+        has_outdated_source = any(source.number in found for source in sources)
+        read = dict(job.scans)
+        for other in redone:
+            read |= other.scans if other.output == job.output else {}
+        if job.kind != "redo" and any(present.get(name, key) != key for name, key in read.items()):
+            found[job.number] = "specimens"
+        elif (
+            job.kind in (*_STUDY, "report", "export", "landmarks")
             and not (job.kind == "redo" or (job.kind == "report" and "--specimens" not in job.arguments))
             and (change := _change_since(project, earlier, forms, job, sources))
+            and not (job.kind == "report" and change == "specimens" and has_outdated_source)
         ):
             found[job.number] = change
-        elif any(_reads(job, output) and output != job.output for output in redone):
+        elif any(other.output in paths[job.number] and other.output != job.output for other in redone):
             found[job.number] = "redone"
-        elif any(source.number in found for source in sources):
+        elif has_outdated_source:
             found[job.number] = "source"
     return found
 
 
-def _reads(job: Job, output: str) -> bool:
-    return any(word == output or word.startswith(f"{output}/") for word in job.arguments)
+def _keys_of(specimens: Sequence[Specimen], scans: Mapping[str, str]) -> dict[str, str]:
+    return {specimen.id: scans[specimen.id] for specimen in specimens if specimen.id in scans}
 
 
 def _change_since(
@@ -489,7 +560,7 @@ def _change_since(
         elif name.endswith(".csv"):
             columns = {*project.state.columns, *next(csv.reader(io.StringIO(before)))}
             used = {"specimen", "subject", *_used_columns(sorted(columns), job.options)}
-            used = columns if job.kind == "report" else used
+            used = frozenset(columns if job.kind == "report" else used)
             rows, rows_before = _rows_of(content, used), _rows_of(before, used)
             if rows != rows_before:
                 is_same = [row[:1] for row in rows] == [row[:1] for row in rows_before]
@@ -502,8 +573,9 @@ def _cells_of(scans: str, column: str) -> set[tuple[str, str]]:
     return {(row["id"], row.get(column, "")) for row in csv.DictReader(io.StringIO(scans))}
 
 
-def _rows_of(table: str, columns: Collection[str]) -> list[list[str]]:
-    """Return the rows of a table with some of its columns, sorted."""
+@lru_cache(maxsize=256)
+def _rows_of(table: str, columns: frozenset[str]) -> list[list[str]]:
+    """Return the rows of a table with some of its columns, sorted; the tables of most jobs are the same."""
     header, *rows = csv.reader(io.StringIO(table))
     kept = [k for k, name in enumerate(header) if name in columns]
     return sorted([row[k] for k in kept] for row in rows)
@@ -561,8 +633,11 @@ def _surfaces(project: Project, before: Job) -> list[str]:
 
 def _surface_files(project: Project, shapes: Job, specimens: Sequence[Specimen]) -> dict[str, str]:
     """Return id -> path in the project's folder of the surface in correspondence, of the specimens that have one."""
-    paths = {specimen.id: f"{shapes.output}/{specimen.id}{CorrespondRecord.SURFACE}" for specimen in specimens}
-    return {name: path for name, path in paths.items() if (project.folder / path).is_file()}
+    files = {specimen.id: f"{specimen.id}{CorrespondRecord.SURFACE}" for specimen in specimens}
+    with suppress(FileNotFoundError):
+        there = {entry.name for entry in os.scandir(project.folder / shapes.output)}
+        return {name: f"{shapes.output}/{file}" for name, file in files.items() if file in there}
+    return {}
 
 
 def _model_ending(name: str) -> str:

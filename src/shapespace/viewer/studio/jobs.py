@@ -1,4 +1,4 @@
-"""The jobs of a project: commands that run one after the other in processes of their own, and their results."""
+"""The jobs of a project: commands that run in processes of their own, and their results."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from typing import Any, Literal
 from msgspec import Struct
 from msgspec.structs import replace
 
+from shapespace.batch.workers import cores
 from shapespace.errors import FileError, InputError, ShapespaceError
 from shapespace.io.files import make_folder, write_text
 from shapespace.schemas import json_text, read
@@ -45,6 +46,7 @@ class Job(Struct, frozen=True, kw_only=True):
         before: arguments of the commands that write its input, in order.
         options: flag -> value, as the user chose them.
         on: number of the job whose shapes a question is about.
+        scans: id of each specimen whose scan is read -> key of the scan, see `scan_key`.
         wanted: whether the job is to run, or has ended.
         status: status of the job.
         code: exit code after the end.
@@ -59,6 +61,7 @@ class Job(Struct, frozen=True, kw_only=True):
     before: tuple[tuple[str, ...], ...] = ()
     options: dict[str, Any] = {}
     on: int | None = None
+    scans: dict[str, str] = {}
     wanted: bool = True
     status: Status = "waiting"
     code: int | None = None
@@ -69,6 +72,11 @@ class Job(Struct, frozen=True, kw_only=True):
     def command(self) -> str:
         """The command line; one line per command."""
         return "\n".join(shlex.join(["shapespace", *words]) for words in (*self.before, self.arguments))
+
+    @property
+    def paths(self) -> frozenset[str]:
+        """Outputs of jobs that its command reads or writes: its arguments, and the first folder of each argument."""
+        return frozenset(self.arguments).union(word.partition("/")[0] for word in self.arguments)
 
 
 @dataclass(frozen=True)
@@ -81,6 +89,7 @@ class Order:
         before: arguments of the commands that write its input, in order.
         on: number of the job whose shapes a question is about.
         files: path in the project's folder -> content of the files that the commands read.
+        scans: id of each specimen whose scan is read -> key of the scan, see `scan_key`.
     """
 
     arguments: tuple[str, ...]
@@ -88,6 +97,7 @@ class Order:
     before: tuple[tuple[str, ...], ...] = ()
     on: int | None = None
     files: Mapping[str, str] = field(default_factory=dict[str, str])
+    scans: Mapping[str, str] = field(default_factory=dict[str, str])
 
     def write_files(self, folder: Path) -> None:
         """Write the files that the commands read into the project's folder.
@@ -101,13 +111,16 @@ class Order:
 
 
 class Jobs:
-    """The owner of the jobs of a project. A thread starts the next one when none runs.
+    """The owner of the jobs of a project, which a thread starts in the order of their numbers.
+
+    A job waits while an earlier one runs or waits that writes what the job reads or writes, or reads what it writes.
 
     Args:
         folder: folder of the project.
         changed: function that is called when a job changed.
         takers: kind of a job -> function that takes the result of such a job into the project, called once after it
             succeeded, also if the studio was closed then; it returns sentences on the parts that were not taken.
+        at_once: largest number of running jobs (default: half of the cores, as many commands use several).
         read_only: whether to only read the jobs; nothing is started or written.
     """
 
@@ -117,15 +130,17 @@ class Jobs:
         changed: Callable[[], None],
         takers: Mapping[str, Callable[[Job], Sequence[str]]] | None = None,
         *,
+        at_once: int | None = None,
         read_only: bool = False,
     ) -> None:
+        self._at_once = max(1, cores() // 2) if at_once is None else at_once
         self._folder = folder / FOLDER
         self._takers = takers or {}
         self._changed = changed
         self._lock = threading.RLock()
         self._jobs: dict[int, Job] = {}
         self._started: dict[int, float] = {}
-        self._seen_progress = 0
+        self._seen_progress: dict[int, int] = {}
         self._stop = threading.Event()
         for path in sorted(self._folder.glob(f"*/{JOB}")):
             with contextlib.suppress(OSError, ValueError):
@@ -171,7 +186,7 @@ class Jobs:
             made.write_files(self._folder.parent)
             job = Job(
                 number=number, kind=kind, arguments=made.arguments, output=made.output, before=made.before,
-                options=dict(options or {}), on=made.on,
+                options=dict(options or {}), on=made.on, scans=dict(made.scans),
             )  # fmt: skip
             make_folder(self.folder_of(job))
             self._put(job)
@@ -256,9 +271,14 @@ class Jobs:
                     if job.status == "running":
                         self._set(self._with_status(job))
                 jobs = self.all()
-                waiting = next((job for job in jobs if job.status == "waiting"), None)
-                if waiting is not None and all(job.status != "running" for job in jobs):
-                    self._start(waiting)
+                active = [job for job in jobs if job.status == "running"]
+                free = self._at_once - len(active)
+                for job in jobs:
+                    if job.status == "waiting" and free > 0:
+                        if not any(job.output in other.paths or other.output in job.paths for other in active):
+                            self._start(job)
+                            free -= 1
+                        active.append(job)  # later jobs do not overtake it if it waits
 
     def _start(self, job: Job) -> None:
         self._started[job.number] = time.time()
@@ -271,8 +291,8 @@ class Jobs:
 
     def _set(self, job: Job) -> None:
         stamp = self._progress_stamp(job)
-        if job != self._jobs[job.number] or stamp != self._seen_progress:
-            self._seen_progress = stamp
+        if job != self._jobs[job.number] or stamp != self._seen_progress.get(job.number):
+            self._seen_progress[job.number] = stamp
             self._jobs[job.number] = job
             if job.status == "done":
                 self._write_history()

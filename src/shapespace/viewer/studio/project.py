@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import filecmp
+import hashlib
 import io
 import json
 import re
@@ -35,7 +36,7 @@ from shapespace.io.containers.json_files import read_json
 from shapespace.io.files import atomic_path, make_folder, write_error, write_text
 from shapespace.io.landmarks.landmark_io import read_surface_landmarks, surface_landmarks_text
 from shapespace.io.meshes.mesh_io import MESH_FILE_ENDINGS, mesh_files, stem_of
-from shapespace.io.tables.table_io import DECIMAL_COMMA, KEYS, key_column, table_text
+from shapespace.io.tables.table_io import DECIMAL_COMMA, KEYS, MISSING, key_column, table_text
 from shapespace.io.volume_io import VOLUME_ENDINGS
 from shapespace.schemas import json_text, read
 from shapespace.store.corresponding import LANDMARKS
@@ -54,6 +55,7 @@ MOST_POINTS = 500
 """Largest number of names of landmarks, which the page lists for each scan."""
 _LONGEST_NAME = 60  # characters of the name of a landmark
 _MOST_UNDONE = 100  # edits that can be undone
+_MOST_TABLES = 32  # texts of tables that are kept: jobs read those of few sets of specimens
 _LONGEST_ID, _LONGEST_CELL = 100, 1000  # characters
 _NO_FILE_NAME = re.compile(r'[/\\:*?"<>|\x00-\x1f]')
 STALE = "Another tab changed the project; look at it and do it again."
@@ -150,6 +152,7 @@ class Project:
         self.revision = 0
         self._undo: list[tuple[str, State]] = []
         self._redo: list[tuple[str, State]] = []
+        self._tables: list[tuple[tuple[object, ...], str]] = []
         self._lock = threading.RLock()
 
     @staticmethod
@@ -192,6 +195,10 @@ class Project:
     def path(self, specimen: Specimen) -> Path:
         """Return the path of a scan."""
         return self.folder / specimen.file
+
+    def scan_keys(self, specimens: Iterable[Specimen]) -> dict[str, str]:
+        """Return the key of the scan of each specimen by its id, see `scan_key`."""
+        return {specimen.id: scan_key(self.path(specimen)) for specimen in specimens}
 
     def edit(self, revision: int | None, change: Callable[[State], tuple[str, State]], *, together: str = "") -> None:
         """Apply an edit, which can be undone.
@@ -411,7 +418,10 @@ class Project:
         columns = tuple(column for column in columns if column.lower() != LANDMARK_COLUMN)  # it would name files
         marks = self._landmark_texts(specimens, names)
         marks_folder = f"{path.stem}-landmarks"
-        files = {specimen.id: _relative(self.path(specimen), path.parent) for specimen in specimens}
+        files = {
+            specimen.id: specimen.file if Path(specimen.file).is_absolute() else f"../{specimen.file}"
+            for specimen in specimens
+        }
         for unit, mirrored in sorted({(specimen.unit, specimen.mirrored) for specimen in specimens} - {("", False)}):
             group = [specimen for specimen in specimens if (specimen.unit, specimen.mirrored) == (unit, mirrored)]
             folder = f"{path.stem}-{unit or 'scans'}{'-mirrored' if mirrored else ''}"
@@ -434,9 +444,13 @@ class Project:
 
     def table(self, specimens: Iterable[Specimen]) -> str:
         """Return the table of specimens, as `compare` reads it."""
-        columns = self.state.columns
-        rows = [(specimen.id, *(specimen.cells.get(column, "") for column in columns)) for specimen in specimens]
-        return table_text(("specimen", *columns), rows)
+        columns, chosen = self.state.columns, tuple(specimens)
+        text = next((text for known, text in self._tables if known == (columns, chosen)), None)
+        if text is None:  # all jobs ask for it after each edit
+            rows = [(specimen.id, *(specimen.cells.get(column, "") for column in columns)) for specimen in chosen]
+            text = table_text(("specimen", *columns), rows)
+            self._tables = [((columns, chosen), text), *self._tables[: _MOST_TABLES - 1]]
+        return text
 
     def landmark_table(self, surfaces: str) -> str:
         """Return the landmarks of the surfaces in a folder as a table: those that the user placed on them, and those
@@ -522,6 +536,7 @@ class PastedBlock(Struct, frozen=True, kw_only=True):
         if not width:
             raise InputError("The pasted block has no cells; copy cells of a spreadsheet.")
         rows = [[*map(str.strip, row), *[""] * (width - len(row))] for row in self.rows]
+        gaps = _emptied(sum(len(row) < width for row in self.rows), [cell for row in rows for cell in row])
         columns = list(state.columns[state.columns.index(self.column) :] if self.column in state.columns else ())
         has_heading = key_column(rows[0]) is not None
         if width == 1 and not self.column:
@@ -530,7 +545,7 @@ class PastedBlock(Struct, frozen=True, kw_only=True):
         named = [fold_name(row[0].replace("\\", "/").rpartition("/")[2]) in known for row in rows]
         has_names = any(name and not is_number(row[0]) for name, row in zip(named, rows, strict=True))
         if not has_heading and self.column and not (has_names and width > 1):
-            return self._by_position(rows, columns)
+            return self._by_position(rows, columns, gaps)
         heads = rows[0][1:]
         is_new = not named[0] and any(named) and not any(map(is_number, heads))
         has_heads = all(heads) and len(set(heads)) == len(heads) and (is_new or set(heads) <= set(state.columns))
@@ -539,19 +554,20 @@ class PastedBlock(Struct, frozen=True, kw_only=True):
             header if has_heading else [KEYS[0], *header[1:]],
             rows,
             state,
+            gaps,
             is_sure=has_heading,
             is_asked=bool(self.column),
         )
 
     def _by_name(
-        self, header: list[str], rows: list[list[str]], state: State, *, is_sure: bool, is_asked: bool
+        self, header: list[str], rows: list[list[str]], state: State, gaps: list[str], *, is_sure: bool, is_asked: bool
     ) -> MatchedBlock:
         width = max(map(len, self.rows))
         text = io.StringIO()
         csv.writer(text, delimiter="\t").writerows([header[:width], *(row[: len(header)] for row in rows)])
         pasted, cells, notes = cells_of_table(text.getvalue().encode(), state, "The pasted block")
         new = tuple(column for column in pasted if column not in state.columns)
-        notes += _beyond(width - len(header), "column")
+        notes += [*gaps, *_beyond(width - len(header), "column")]
         names = {fold_name(column) for column in state.columns}
         is_sure = is_sure and not any(fold_name(column) in names for column in new)
         return MatchedBlock(
@@ -562,8 +578,8 @@ class PastedBlock(Struct, frozen=True, kw_only=True):
             notes=tuple(notes),
         )
 
-    def _by_position(self, rows: list[list[str]], columns: list[str]) -> MatchedBlock:
-        notes: list[str] = []
+    def _by_position(self, rows: list[list[str]], columns: list[str], gaps: list[str]) -> MatchedBlock:
+        notes = gaps
         if rows[0] == columns[: len(rows[0])] and len(rows) > 1:
             notes.append("The first row contains the headings of these columns, and is not pasted.")
             rows = rows[1:]
@@ -573,8 +589,21 @@ class PastedBlock(Struct, frozen=True, kw_only=True):
             values = [own[column] for own in cells.values() if column in own]
             for own in cells.values():
                 if column in own:
-                    own[column] = _with_point(own[column], values)
+                    own[column] = "" if own[column].lower() in MISSING else _with_point(own[column], values)
         return MatchedBlock(cells=cells, by_name=False, certain=not notes and len(rows) == 1, notes=tuple(notes))
+
+
+def _emptied(short_rows: int, cells: Sequence[str]) -> list[str]:
+    """Return sentences on the cells of a block that become empty although they are absent, or have a text."""
+    marks = [cell for cell in cells if cell and cell.lower() in MISSING]
+    notes: list[str] = []
+    if short_rows:
+        rows = "1 row is shorter than the others: its" if short_rows == 1 else f"{short_rows} rows are shorter: their"
+        notes.append(f"{rows} last cells become empty.")
+    if marks:
+        word = "1 cell is" if len(marks) == 1 else f"{len(marks)} cells are"
+        notes.append(f"{word} marked as missing ({', '.join(dict.fromkeys(marks))}), and will be empty.")
+    return notes
 
 
 def _beyond(count: int, noun: str) -> list[str]:
@@ -863,6 +892,16 @@ def _count_text(ids: Iterable[str]) -> str:
     return names[0] if len(names) == 1 else f"{len(names)} specimens"
 
 
+def scan_key(scan: Path) -> str:
+    """Return a key that changes with the content of a scan: that of its name, size and time of change."""
+    try:
+        stat = scan.stat()
+        text = f"{scan.name}|{stat.st_size}|{stat.st_mtime_ns}"  # without the folder: projects are moved
+    except OSError:
+        text = f"{scan}|missing"
+    return hashlib.sha256(text.encode(errors="surrogateescape")).hexdigest()[:24]
+
+
 def _ending(name: str) -> str:
     known = (*MESH_FILE_ENDINGS, *VOLUME_ENDINGS)
     return next((end for end in sorted(known, key=len, reverse=True) if name.lower().endswith(end)), "")
@@ -878,12 +917,6 @@ def _free_name(stem: str, taken: set[str], ending: str = "") -> str:
     """Return the first of stem, stem-2, stem-3, ... that is not `taken` (in lower case) with its ending."""
     numbered = (f"{stem}{'' if number == 1 else f'-{number}'}{ending}" for number in count(1))
     return next(name for name in numbered if name.casefold() not in taken)
-
-
-def _relative(path: Path, folder: Path) -> str:
-    """Return `path` relative to `folder` if both lie in the same project, else as it is."""
-    project = folder.parent
-    return f"../{path.relative_to(project).as_posix()}" if path.is_relative_to(project) else str(path)
 
 
 def recent_projects(add: Path | None = None) -> list[dict[str, Any]]:

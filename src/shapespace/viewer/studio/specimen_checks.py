@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import hashlib
 import json
 import multiprocessing
 import os
@@ -28,6 +27,7 @@ from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.report.render.scene import decimate, pack
 from shapespace.report.render.thumbnails import mesh_still
 from shapespace.types import Mesh
+from shapespace.viewer.studio.project import scan_key
 
 _FOLDER = "checks"
 _MOST_PROCESSES = 4
@@ -36,7 +36,7 @@ _MOST_BORDERS = 50_000  # edges of borders that are drawn
 
 
 class SpecimenChecks:
-    """The owner of the checks of a project's scans. Files are identified by name, size and time of change.
+    """The owner of the checks of a project's scans, which are identified by `scan_key`.
 
     Args:
         folder: folder of the project.
@@ -59,7 +59,7 @@ class SpecimenChecks:
 
     def facts(self, scan: Path) -> dict[str, Any] | None:
         """Return the facts of a scan, or None while it is checked; the first call asks for the check."""
-        key = _key(scan)
+        key = scan_key(scan)
         if key in self._known:
             return self._known[key]
         try:
@@ -75,7 +75,7 @@ class SpecimenChecks:
 
     def picture(self, scan: Path) -> Path:
         """Return the path of the picture of a scan, which exists once it was checked and is usable."""
-        return self._folder / f"{_key(scan)}.webp"
+        return self._folder / f"{scan_key(scan)}.webp"
 
     def surface(self, scan: Path, *, mirrored: bool) -> Future[bytes]:
         """Return the packed surface of a scan for a view, as it is in its file or reflected at x = 0.
@@ -97,9 +97,11 @@ class SpecimenChecks:
             raise InputError(f"{volume.name}: the memory does not suffice for it; crop or resample it.") from error
 
     def close(self) -> None:
-        """End the processes."""
+        """End the processes after the checks that they make now."""
         if self._pool is not None:
-            self._pool.shutdown(wait=False, cancel_futures=True)
+            # Without a wait its thread may close a pipe while the end of the program writes into it: "Bad file
+            # descriptor"; and a check may be written after the lock of the project was released.
+            self._pool.shutdown(wait=True, cancel_futures=True)
 
     def _ask(self, key: str, scan: Path) -> None:
         if key in self._asked or self._read_only:
@@ -233,12 +235,3 @@ def _without_folder(error: ShapespaceError, scan: Path) -> str:
 def _unusable(text: str) -> dict[str, Any]:
     findings = [{"level": "refused", "text": text}]
     return {"state": "unusable", "vertices": 0, "triangles": 0, "extent": 0.0, "findings": findings}
-
-
-def _key(scan: Path) -> str:
-    try:
-        stat = scan.stat()
-        text = f"{scan.name}|{stat.st_size}|{stat.st_mtime_ns}"  # without the folder: projects are moved
-    except OSError:
-        text = f"{scan}|missing"
-    return hashlib.sha256(text.encode(errors="surrogateescape")).hexdigest()[:24]
