@@ -67,6 +67,7 @@ from shapespace.viewer.studio.project import (
     cells_of_table,
     change_of,
     recent_projects,
+    scan_key,
     with_cells,
     with_points,
 )
@@ -140,11 +141,18 @@ class OpenProject:
             self._odd = key, {key[k][0]: odd for k, odd in found.items()}
         return self._odd[1]
 
+    def scan_contents(self) -> dict[str, str]:
+        """Return the hash of the scan of each specimen by its id, of those that were checked."""
+        checked = {
+            specimen.id: self.checks.facts(self.project.path(specimen)) for specimen in self.project.state.specimens
+        }
+        return {name: facts["content"] for name, facts in checked.items() if facts and "content" in facts}
+
     def facts(self) -> dict[str, Any]:
         """Return the state for the page."""
         jobs, project = self.jobs.all(), self.project  # in this order: a job that is done has changed the state
         state = project.state
-        scans = project.scan_keys(state.specimens)
+        scans = self.scan_contents()
         key = (state, scans, [(job.number, job.status) for job in jobs])
         if key != self._outdated[0]:
             self._outdated = key, outdated_results(project, jobs, self._forms, scans)
@@ -156,8 +164,9 @@ class OpenProject:
             specimens.append({
                 "id": specimen.id, "file": specimen.file, "set": specimen.role, "included": specimen.included,
                 "unit": specimen.unit, "mirrored": specimen.mirrored, "groomed": bool(specimen.original),
-                "cells": specimen.cells, "points": specimen.points, "scan": scans[specimen.id],
-                **{key: fact for key, fact in facts.items() if key != "profile"},
+                "cells": specimen.cells, "points": specimen.points,
+                "scan": scan_key(project.path(specimen)),
+                **{key: fact for key, fact in facts.items() if key not in ("profile", "content")},
                 "findings": [{**finding, "text": self._sentence(finding["text"])} for finding in facts["findings"]],
             })  # fmt: skip
         return {
@@ -468,8 +477,8 @@ class Studio:
         opened = self._project
 
         def make(number: int, before: list[Job]) -> Order:
-            scans = opened.project.scan_keys(opened.project.state.specimens)
-            return order(opened.project, before, self._forms, kind, cast(dict[str, Any], options), on, number, scans)
+            given = cast(dict[str, Any], options)
+            return order(opened.project, before, self._forms, kind, given, on, number, opened.scan_contents())
 
         job = await run_in_threadpool(opened.jobs.add, kind, make, cast(dict[str, Any], options))
         return json_response({"number": job.number}, 201)

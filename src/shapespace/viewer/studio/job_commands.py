@@ -129,7 +129,7 @@ def order(
         options: flag -> value, as sent by the page.
         on: number of the job whose result it uses; None for the newest that succeeded.
         number: number of the new job.
-        scans: id of each specimen -> key of its scan, for the record of the scans that are read.
+        scans: id of each specimen -> hash of its scan, for the record of the scans that are read.
 
     Raises:
         InputError: it cannot be run: no such kind or option, or a result or specimens are missing.
@@ -496,8 +496,8 @@ def outdated_results(
     """Return what changed since results were computed, by the numbers of their jobs; other results are up to date.
 
     A result is up to date if the command for the same choices, with the same source, and the files that it would read
-    are those of its job; of tables only the columns count that it uses. `scans` has the present key of the scan of each
-    specimen by its id.
+    are those of its job; of tables only the columns count that it uses. `scans` has the present hash of each scan by the
+    id of its specimen.
     """
     found: dict[int, Outdated] = {}
     present = _keys_of([specimen for specimen in project.state.specimens if specimen.included], scans)

@@ -46,7 +46,7 @@ class Job(Struct, frozen=True, kw_only=True):
         before: arguments of the commands that write its input, in order.
         options: flag -> value, as the user chose them.
         on: number of the job whose shapes a question is about.
-        scans: id of each specimen whose scan is read -> key of the scan, see `scan_key`.
+        scans: id of each specimen whose scan is read -> hash of the scan, if it was checked.
         wanted: whether the job is to run, or has ended.
         status: status of the job.
         code: exit code after the end.
@@ -89,7 +89,7 @@ class Order:
         before: arguments of the commands that write its input, in order.
         on: number of the job whose shapes a question is about.
         files: path in the project's folder -> content of the files that the commands read.
-        scans: id of each specimen whose scan is read -> key of the scan, see `scan_key`.
+        scans: id of each specimen whose scan is read -> hash of the scan, if it was checked.
     """
 
     arguments: tuple[str, ...]

@@ -196,10 +196,6 @@ class Project:
         """Return the path of a scan."""
         return self.folder / specimen.file
 
-    def scan_keys(self, specimens: Iterable[Specimen]) -> dict[str, str]:
-        """Return the key of the scan of each specimen by its id, see `scan_key`."""
-        return {specimen.id: scan_key(self.path(specimen)) for specimen in specimens}
-
     def edit(self, revision: int | None, change: Callable[[State], tuple[str, State]], *, together: str = "") -> None:
         """Apply an edit, which can be undone.
 
@@ -893,7 +889,7 @@ def _count_text(ids: Iterable[str]) -> str:
 
 
 def scan_key(scan: Path) -> str:
-    """Return a key that changes with the content of a scan: that of its name, size and time of change."""
+    """Return a key that changes with a scan: that of its name, size and time of change."""
     try:
         stat = scan.stat()
         text = f"{scan.name}|{stat.st_size}|{stat.st_mtime_ns}"  # without the folder: projects are moved

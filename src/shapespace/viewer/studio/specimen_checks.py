@@ -22,7 +22,7 @@ from shapespace.errors import FileError, InputError, ShapespaceError
 from shapespace.geometry.doctor import examine_and_repair
 from shapespace.geometry.mirror_plane import mirror_image
 from shapespace.geometry.normals import boundary_edges, drawable
-from shapespace.io.files import write_bytes, write_text
+from shapespace.io.files import sha256_of_file, write_bytes, write_text
 from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.report.render.scene import decimate, pack
 from shapespace.report.render.thumbnails import mesh_still
@@ -32,6 +32,7 @@ from shapespace.viewer.studio.project import scan_key
 _FOLDER = "checks"
 _MOST_PROCESSES = 4
 _MOST_DRAWN, _MOST_TURNING = 100_000, 12_000  # triangles of a scan in its view, at rest and while it turns
+_KEY = 24  # hexadecimal digits of the hash of a scan
 _MOST_BORDERS = 50_000  # edges of borders that are drawn
 
 
@@ -67,7 +68,7 @@ class SpecimenChecks:
         except (OSError, ValueError):
             self._ask(key, scan)
             return None
-        if facts.get("state") == "ready" and "profile" not in facts:  # from an earlier version
+        if facts.get("state") == "ready" and not {"profile", "content"} <= facts.keys():  # from an earlier version
             self._ask(key, scan)
             return None
         self._known[key] = facts
@@ -186,6 +187,8 @@ def check_scan(scan: Path, stem: Path) -> dict[str, Any]:
             write_bytes(stem.with_suffix(".webp"), picture)
     except ShapespaceError as error:
         facts = _unusable(_without_folder(error, scan))
+    with contextlib.suppress(ShapespaceError):  # of a file that cannot be read, which is a finding
+        facts["content"] = sha256_of_file(scan)[:_KEY]
     write_text(stem.with_suffix(".json"), json.dumps(facts))
     return facts
 
