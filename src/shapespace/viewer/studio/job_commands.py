@@ -496,8 +496,8 @@ def outdated_results(
     """Return what changed since results were computed, by the numbers of their jobs; other results are up to date.
 
     A result is up to date if the command for the same choices, with the same source, and the files that it would read
-    are those of its job; of tables only the columns count that it uses. `scans` has the present hash of each scan by the
-    id of its specimen.
+    are those of its job; of tables only the columns count that it uses. `scans` has the present hash of each scan by
+    the id of its specimen.
     """
     found: dict[int, Outdated] = {}
     present = _keys_of([specimen for specimen in project.state.specimens if specimen.included], scans)
