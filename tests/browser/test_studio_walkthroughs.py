@@ -10,6 +10,7 @@ from pictures import same_as_kept
 from test_landmarks_in_browser import VIEW, close_scan, open_scan, placed, project_points
 from test_studio_in_browser import WINDOW, User, has_drawn, studio, write_bones
 
+from shapespace.cli import main
 from shapespace.datasets.bones import EFFECT_MM, Bone
 from shapespace.datasets.organs import raw_surface
 from shapespace.io.meshes.mesh_io import read_mesh
@@ -111,3 +112,46 @@ def test_a_study_with_landmarks(open_tab, tmp_path: Path) -> None:
     report = (project / "report-4" / "report.html").read_text(encoding="utf-8")
     assert "bone_007" in report and "group" in report
     assert json.loads((project / "jobs" / "0004" / "exit.json").read_text())["code"] == 0
+
+
+@pytest.mark.long
+def test_a_study_from_label_volumes(open_tab, tmp_path: Path) -> None:
+    masks, project = tmp_path / "masks", tmp_path / "organs"
+    assert main(["data", "organs", "-o", str(masks), "--count", "12", "--volumes", "--quiet"]) == 0
+    *volumes, new = sorted(masks.glob("*.nii.gz"))
+    with studio(project, tmp_path) as address:
+        tab = open_tab(address, WINDOW)
+        user = User(tab)
+        user.sees("drop-zone")
+        tab.page.get_by_test_id("choose-files-input").set_input_files(volumes)
+        tab.page.get_by_test_id("volumes").get_by_text("11 surfaces will be added").wait_for()
+        same_as_kept("screen-volumes.png", tab.shot("labels"), width=1200)
+        user.click("volumes-make")
+        tab.until("document.querySelectorAll('[data-testid^=card-] img').length === 11", 180)
+        same_as_kept(
+            "screen-surfaces.png", tab.shot("surfaces", clip={"x": 0, "y": 0, "width": 1440, "height": 560}), width=1200
+        )
+        user.click("next")
+        tab.page.get_by_test_id("option--vertices").fill("800")
+        user.click("run-correspond")
+        user.has_run(2)
+        user.click("next")
+        tab.page.get_by_test_id("form-build").get_by_test_id("option--gauge").select_option("form")
+        user.click("run-build")
+        user.has_run(3)
+        user.click("next")
+        user.click("question-allometry")
+        user.click("run-allometry")
+        user.has_run(4)
+        user.sees("sentences")
+        tab.page.get_by_test_id("tab-fit").click()
+        tab.page.locator("[data-testid=screen-fit] input[type=file]").first.set_input_files(new)
+        user.click("volumes-make")
+        tab.page.get_by_test_id("new-scans").get_by_text("1 new scan").wait_for(timeout=120_000)
+        user.click("run-fit")
+        user.has_run(6)
+        has_drawn(tab)
+        same_as_kept("screen-fit.png", tab.shot("fit"), width=1200)
+        assert tab.complaints == []
+    record = json.loads(next((project / "fits-6").glob("*.fit.json")).read_text(encoding="utf-8"))
+    assert record["status"] in ("converged", "doubtful") and ShapeModel.load(project / "model-3.h5").n_modes == 10

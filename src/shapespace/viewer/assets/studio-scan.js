@@ -47,10 +47,14 @@
   function Coordinates({ specimen, name, onmove }) {
     const point = sent.get(`${specimen.id}/${name}`) || specimen.points[name];
     const [draft, setDraft] = useState(null);
-    useEffect(() => setDraft(null), [name, String(point)]);
+    const typing = useRef(false); // whether the draft is not sent yet; an answer to what was sent must not end it
+    useEffect(() => { typing.current = false; setDraft(null); }, [name]);
+    useEffect(() => { if (!typing.current) setDraft(null); }, [String(point)]);
+    const change = (values) => { typing.current = true; setDraft(values); };
     const values = draft || point || ["", "", ""];
     const numbers = values.map((value) => (String(value).trim() ? Number(String(value).replace(",", ".")) : NaN));
     const send = async () => {
+      typing.current = false;
       if (!draft || !numbers.every(Number.isFinite) || String(numbers) === String(point)) return;
       setDraft(null);
       await place(specimen, name, numbers);
@@ -62,12 +66,12 @@
       if (!step || !numbers.every(Number.isFinite)) return;
       event.preventDefault();
       const next = numbers.map((value, k) => (k === axis ? Number((value + (step * specimen.extent) / STEPS).toPrecision(12)) : value));
-      setDraft(next);
+      change(next);
       onmove([name, next]);
     };
     return html`<fieldset class="choices coordinates" data-testid="coordinates"><legend>${M.coordinates(name)}</legend>
       ${AXES.map((axis, k) => html`<label>${axis} <input inputmode="decimal" size="9" data-testid=${`mark-${axis}`} aria-label=${M.axis(axis, name)} value=${values[k]} onkeydown=${(event) => key(event, k)}
-        onkeyup=${(event) => { if (event.key.startsWith("Arrow")) send(); }} oninput=${(event) => setDraft(values.map((value, other) => (other === k ? event.target.value : value)))} onblur=${send} /></label>`)}
+        onkeyup=${(event) => { if (event.key.startsWith("Arrow")) send(); }} oninput=${(event) => change(values.map((value, other) => (other === k ? event.target.value : value)))} onblur=${send} /></label>`)}
       <small class="hint">${M.file}</small></fieldset>`;
   }
 

@@ -59,10 +59,10 @@
   /** What is being added, and what was not. */
   function UploadStatus() {
     const { total, done, added, notes } = Studio.uploads;
-    if (!total) return null;
+    if (!total || (!Studio.uploading() && !added && !notes.length && !Studio.volumes.length)) return null; // volumes became specimens
     return html`
       <div class="uploads" data-testid="uploads">
-        <p role="status">${Studio.uploading() ? T.uploads.progress(done, total) : T.uploads.finished(added)}</p>
+        <p role="status">${Studio.uploading() ? T.uploads.progress(done, total) : added || notes.length ? T.uploads.finished(added) : ""}</p>
         ${Studio.uploading() && html`<progress class="upload-bar" max=${total} value=${done} aria-label=${T.uploads.progress(done, total)}></progress>`}
         ${notes.length > 0 && html`<details open=${notes.length <= 3}><summary>${T.count(notes.length, "note")}</summary>
           <ul data-testid="upload-notes">${notes.slice(0, 200).map((note) => html`<li>${note}</li>`)}</ul></details>`}

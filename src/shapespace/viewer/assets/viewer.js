@@ -100,7 +100,6 @@
       page.stage = new Viewer.Stage(page);
       $("about").textContent = `${about.model}: ${about.vertices.toLocaleString("en")} vertices, ${about.modes} ${about.modes === 1 ? "mode" : "modes"}`;
       page.fitView = new Viewer.FitView($("fit-detail"), { stage: page.stage, model, about, apply, download: modelTab.download });
-      page.stage.a.on("draw", ready);
       window.shapespaceStage = page.stage;
       modelTab.start();
       compareTab.start();
@@ -108,7 +107,6 @@
       modelTab.draw();
       page.stage.a.frame(["model"], ROOM);
       $("loading").hidden = true;
-      if (!page.stage.a.works) ready();
       await fitsTab.start(wanted.fit);
       if (disposed) return;
       const tab = TABS.includes(wanted.tab) && !$(`tab-${wanted.tab}`).hidden ? wanted.tab : about.has_fits && !isChosen ? "fits" : page.shown;
@@ -116,6 +114,9 @@
       if (disposed) return;
       Viewer.setCamera(page.stage.a, wanted.camera);
       page.stage.a.on("camera", page.onplace);
+      page.stage.a.on("draw", ready);
+      if (page.stage.a.works) page.stage.a.request();
+      else ready();
     }
 
     let isReady = false;
