@@ -67,10 +67,16 @@ class User:
 
 def has_drawn(tab, seconds: float = 60.0) -> None:
     """Wait until the result has drawn."""
+    waits = (
+        f"[...{PANE}.shadowRoot.querySelectorAll('.turning:not(.running, .refused), [aria-busy=true]')].some((part) => "
+        "{ const box = part.getBoundingClientRect(); return box.top < innerHeight && box.bottom >= 0; })"
+    )
     tab.until(
-        f"{PANE}?.dataset.ready === 'true' && [...window.Shapespace.sceneParts.views].every((view) => view.rests)",
+        f"{PANE}?.dataset.ready === 'true' && !{waits} && "
+        "[...window.Shapespace.sceneParts.views].every((view) => view.rests)",
         seconds,
     )
+    tab.page.wait_for_timeout(300)
 
 
 def place_and_drag(tab, project: Path) -> None:
@@ -245,7 +251,8 @@ def test_raw_scans_become_a_report_by_clicks_and_history_gives_the_same_numbers(
             User(seen).sees("sentences")
             has_drawn(seen)
             seen.shot("read-only")
-            assert seen.page.locator("[data-testid^=outdated]").count() == 0
+            # A specimen that was excluded in the morphospace is in this answer.
+            assert seen.page.locator("[data-testid^=outdated]").count() == (count == 12)
             assert seen.page.get_by_test_id("form-compare").count() == 0
             assert barriers(seen) == [] and seen.complaints == []
     again = tmp_path / "again"

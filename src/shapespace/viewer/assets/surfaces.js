@@ -259,6 +259,7 @@
 
     /** Ask for the worst places of the surfaces of the page, one after the other, as each scan is read for them. */
     async function findFaults(mine, shown) {
+      $("faults").ariaBusy = "true";
       for (const { name } of shown) {
         let found = null;
         try { found = await binary(`api/faults/${encodeURIComponent(name)}`); } catch (error) { /* its surface is not shown either */ }
@@ -267,6 +268,7 @@
         drawFaults();
       }
       if (colour === "growth" || colour === "distance") { cells.forEach(paint); drawBar(); }
+      $("faults").ariaBusy = "false";
     }
 
     /** Turn all surfaces so that a place faces the user, and mark it. */

@@ -116,8 +116,9 @@ class State(Struct, frozen=True, kw_only=True):
         return [(specimen.id, *names_of_file(Path(specimen.file).name)) for specimen in self.specimens]
 
     def chosen(self, role: Role) -> tuple[Specimen, ...]:
-        """Return the included specimens of a role."""
-        return tuple(specimen for specimen in self.specimens if specimen.included and specimen.role == role)
+        """Return the included specimens of a role by name: the order in which they were added differs between drops."""
+        chosen = (specimen for specimen in self.specimens if specimen.included and specimen.role == role)
+        return tuple(sorted(chosen, key=lambda specimen: name_key(specimen.id)))
 
     def notes(self) -> list[str]:
         """Return sentences on classes of the table that may be misspelt."""
