@@ -537,6 +537,18 @@ def test_specimens_that_are_excluded_are_in_no_result(answered: Done, kind: str)
     assert "correspondence-1" not in made.arguments or kind in QUESTIONS or kind in ("report", "study")
 
 
+@pytest.mark.parametrize("change", [{"what": "set", "set": "new"}, {"what": "remove"}])
+def test_specimens_that_are_moved_to_the_new_scans_or_removed_are_not_in_the_next_model(
+    answered: Done, change: dict[str, str]
+) -> None:
+    edit(answered.project, **change, ids=["anna"])
+    assert answered.outdated == {2: "specimens", 3: "specimens", 4: "specimens", 5: "source"}
+    made = order(answered.project, answered.jobs, answered.forms, "build", {}, None, 6)
+    assert {Path(word).name for word in made.arguments if "/" in word} == {
+        f"{name}{CorrespondRecord.SURFACE}" for name in ("ben", "carl")
+    }
+
+
 def test_fits_of_excluded_specimens_are_not_exported(answered: Done) -> None:
     project = answered.project
     for k, name in enumerate(("dora", "emil")):

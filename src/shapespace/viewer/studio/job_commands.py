@@ -621,23 +621,39 @@ def _require_specimens(specimens: Sequence[Specimen], purpose: str, least: int) 
 
 
 def _surfaces(project: Project, before: Job) -> list[str]:
-    """Return the folder in correspondence, or the surfaces of the included specimens if others are excluded."""
-    excluded = [specimen for specimen in project.state.specimens if not specimen.included]
-    if not _surface_files(project, before, excluded):
+    """Return the folder in correspondence, or the surfaces of the included training specimens if it has others.
+
+    A surface without a specimen is that of a removed one, unless a specimen without a surface may be a renamed one.
+    """
+    chosen = project.state.chosen("training")
+    included, there = _surface_files(project, before, chosen), _surface_names(project, before)
+    others = there.intersection(specimen.id for specimen in project.state.specimens).difference(included)
+    if len(included) == len(chosen):
+        others = there.difference(included)
+    if not others:
         return [before.output]
-    included = _surface_files(project, before, project.state.chosen("training"))
     if len(included) < 2:
         raise InputError("Fewer than two included specimens are in correspondence; include more.")
     return list(included.values())
 
 
+def _surface_names(project: Project, shapes: Job) -> set[str]:
+    """Return the names of the specimens with a surface in correspondence."""
+    with suppress(FileNotFoundError):
+        names = [path.name for path in (project.folder / shapes.output).iterdir()]
+        ending = CorrespondRecord.SURFACE
+        return {name.removesuffix(ending) for name in names if name.endswith(ending)}
+    return set()
+
+
 def _surface_files(project: Project, shapes: Job, specimens: Sequence[Specimen]) -> dict[str, str]:
     """Return id -> path in the project's folder of the surface in correspondence, of the specimens that have one."""
-    files = {specimen.id: f"{specimen.id}{CorrespondRecord.SURFACE}" for specimen in specimens}
-    with suppress(FileNotFoundError):
-        there = {entry.name for entry in os.scandir(project.folder / shapes.output)}
-        return {name: f"{shapes.output}/{file}" for name, file in files.items() if file in there}
-    return {}
+    there = _surface_names(project, shapes)
+    return {
+        specimen.id: f"{shapes.output}/{specimen.id}{CorrespondRecord.SURFACE}"
+        for specimen in specimens
+        if specimen.id in there
+    }
 
 
 def _model_ending(name: str) -> str:
