@@ -167,14 +167,8 @@ def order(
     if kind == "build":
         before = result_of(jobs, CORRESPONDENCES, on)
         output = f"model-{number}.h5"
-        marks, files = tuple[str, ...](), dict[str, str]()
-        if state.landmarks and "--landmarks" not in options:
-            if state.landmarks_on not in ("", before.output):
-                raise InputError(
-                    f"The landmarks were placed on {state.landmarks_on}; place them on {before.output}, or remove them."
-                )
-            marks = ("--landmarks", f"{stem}-landmarks.csv")
-            files[marks[1]] = project.landmark_table(before.output)
+        files = {} if "--landmarks" in options else _landmark_files(project, before.output, stem)
+        marks = ("--landmarks", *files) if files else ()
         return Order((*words, *_surfaces(project, before), "-o", output, *marks, *given), output, files=files)
     if kind == "quality":
         output = f"quality-{number}"
@@ -291,8 +285,29 @@ def _question(project: Project, shapes: Job, forms: Forms, kind: str, options: M
             output, on=shapes.number, files=files,
         )  # fmt: skip
     files = {f"{stem}.csv": project.table(_require_specimens(chosen, "to analyse", 2))}
+    if options.get("--geometry") == "landmarks" and not options.get("--landmarks") and shapes.kind in CORRESPONDENCES:
+        marks = _landmark_files(project, shapes.output, stem)
+        files |= marks
+        given += [word for name in marks for word in ("--set", f"landmarks={name}")]
     arguments = (*words, f"{stem}.csv", "--shapes", shapes.output, "-o", output, *given)
     return Order(arguments, output, on=shapes.number, files=files)
+
+
+def _landmark_files(project: Project, surfaces: str, stem: str) -> dict[str, str]:
+    """Return the path and the content of the table of the landmarks that the user placed on surfaces, and of those of
+    their scans; empty if the user placed none.
+
+    Raises:
+        InputError: they were placed on other surfaces.
+    """
+    state = project.state
+    if not state.landmarks:
+        return {}
+    if state.landmarks_on not in ("", surfaces):
+        raise InputError(
+            f"The landmarks were placed on {state.landmarks_on}; place them on {surfaces}, or remove them."
+        )
+    return {f"{stem}-landmarks.csv": project.landmark_table(surfaces)}
 
 
 def shapes_of(jobs: Sequence[Job], kind: str, on: int | None) -> Job:
@@ -508,15 +523,15 @@ def outdated_results(
         sources = [other for other in earlier if other.output in paths[job.number]]
         redone = [other for other in done if other.kind == "redo" and other.number > job.number]
         has_outdated_source = any(source.number in found for source in sources)
-        read = dict(job.scans)
-        for other in redone:
-            read |= other.scans if other.output == job.output else {}
+        read, own = dict(job.scans), [other for other in redone if other.output == job.output]
+        for other in own:
+            read |= other.scans
         if job.kind != "redo" and any(present.get(name, key) != key for name, key in read.items()):
             found[job.number] = "specimens"
         elif (
             job.kind in (*_STUDY, "report", "export", "landmarks")
             and not (job.kind == "redo" or (job.kind == "report" and "--specimens" not in job.arguments))
-            and (change := _change_since(project, earlier, forms, job, sources))
+            and (change := _change_since(project, earlier, forms, job, sources, own))
             and not (job.kind == "report" and change == "specimens" and has_outdated_source)
         ):
             found[job.number] = change
