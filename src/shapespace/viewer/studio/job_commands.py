@@ -547,30 +547,41 @@ def _keys_of(specimens: Sequence[Specimen], scans: Mapping[str, str]) -> dict[st
 
 
 def _change_since(
-    project: Project, earlier: Sequence[Job], forms: Forms, job: Job, sources: Sequence[Job]
+    project: Project, earlier: Sequence[Job], forms: Forms, job: Job, sources: Sequence[Job], redone: Sequence[Job]
 ) -> Outdated | None:
     on = job.on if job.on is not None or not sources or job.kind == "report" else sources[-1].number
     try:
         now = order(project, earlier, forms, job.kind, job.options, on, job.number)
     except (InputError, FileError):
-        moved = job.kind == "build" and bool(sources) and project.state.landmarks_on not in ("", sources[-1].output)
+        has_marks = job.kind == "build" or job.options.get("--geometry") == "landmarks"
+        moved = has_marks and bool(sources) and project.state.landmarks_on not in ("", sources[-1].output)
         return "landmarks" if moved else "specimens"
     is_each = job.kind in ("correspond", "fit", "complete")  # each scan has a result, also if others are excluded later
     if now.arguments != job.arguments and job.kind != "report":
-        has_marks = ["--landmarks" in arguments for arguments in (now.arguments, job.arguments)]
-        return "landmarks" if has_marks[0] != has_marks[1] else "specimens"
+        are_marked = ["-landmarks.csv" in " ".join(arguments) for arguments in (now.arguments, job.arguments)]
+        return "landmarks" if are_marked[0] != are_marked[1] else "specimens"
+    numbers = {str(other.options.get("name")): other.number for other in redone}  # of the job that read a scan last
     for name, content in now.files.items():
         try:
-            before = (project.folder / name).read_text(encoding="utf-8")
+            number = numbers.get(Path(name).stem, job.number) if f"{job.number:04d}-landmarks/" in name else job.number
+            before = (project.folder / name.replace(f"{job.number:04d}", f"{number:04d}", 1)).read_text(
+                encoding="utf-8"
+            )
         except OSError:
             continue  # the file was removed, so there is nothing to compare
         if name.startswith(f"{_INPUTS}/{job.number:04d}-landmarks"):
             if content != before:
                 return "landmarks"
         elif is_each:
-            if _cells_of(content, "file") - _cells_of(before, "file"):
+            listed, listed_before = _scans_of(content, job.number), _scans_of(before, job.number)
+            for other in redone:
+                with suppress(OSError):
+                    path = project.folder / f"{_INPUTS}/{other.number:04d}.csv"
+                    listed_before |= _scans_of(path.read_text(encoding="utf-8"), other.number)
+            pairs = [(cells, listed_before.get(name, ("", ""))) for name, cells in listed.items()]
+            if any(cells[0] != cells_before[0] for cells, cells_before in pairs):
                 return "specimens"
-            if _cells_of(content, LANDMARK_COLUMN) - _cells_of(before, LANDMARK_COLUMN):
+            if any(cells != cells_before for cells, cells_before in pairs):
                 return "landmarks"
         elif name.endswith(".csv"):
             columns = {*project.state.columns, *next(csv.reader(io.StringIO(before)))}
@@ -583,9 +594,18 @@ def _change_since(
     return None
 
 
-def _cells_of(scans: str, column: str) -> set[tuple[str, str]]:
-    """Return the ids and the cells of a column of a list of scans; cells of a column that it lacks are empty."""
-    return {(row["id"], row.get(column, "")) for row in csv.DictReader(io.StringIO(scans))}
+def _scans_of(scans: str, number: int) -> dict[str, tuple[str, str]]:
+    """Return id -> file of the scan and of its landmarks, in a list of scans that the job with this number reads.
+
+    The number is removed from files that were written for the job. A file of landmarks is empty without landmarks.
+    """
+    return {
+        row["id"]: (
+            row["file"].removeprefix(f"{number:04d}-"),
+            row.get(LANDMARK_COLUMN, "").removeprefix(f"{number:04d}-"),
+        )
+        for row in csv.DictReader(io.StringIO(scans))
+    }
 
 
 @lru_cache(maxsize=256)
