@@ -381,7 +381,7 @@ def checks(
         shapes: job whose shapes a question is about; None for other kinds.
         odd: sentences on specimens that differ from the others.
     """
-    chosen = _specimens_of(project, shapes)
+    listed = chosen = _specimens_of(project, shapes)
     columns = _used_columns(project.state.columns, options)
     missing = {column: sum(not specimen.cells.get(column) for specimen in chosen) for column in columns}
     of_all = len(chosen)
@@ -441,7 +441,7 @@ def checks(
         if text:
             found.append({"level": "problem", "text": text})
     if not any(finding["level"] == "problem" for finding in found):
-        reason = _reason_of_rejection(project, forms, kind, options, shapes, [specimen.id for specimen in chosen])
+        reason = _reason_of_rejection(project, forms, kind, options, shapes, [specimen.id for specimen in listed])
         for column in columns if reason else ():
             is_group = column in (options.get("--group"), options.get("--points"))
             if is_group and len(chosen) == len({specimen.cells.get(column) for specimen in chosen}):
@@ -484,18 +484,17 @@ def _reason_of_rejection(
 
 
 def _write_small_surfaces(project: Project, shapes: Job, names: Sequence[str], folder: Path, ways: int) -> None:
-    """Write small symmetric surfaces, which vary in `ways` ways, into `folder`: for each name that has one in `shapes`,
-    or all if `shapes` has no folder, with its record."""
+    """Write small symmetric surfaces, which vary in `ways` ways, into `folder`: for each specimen that has one in
+    `shapes`, also if it was excluded, as the record lists it; or for all `names` if `shapes` has no folder."""
     rng = np.random.default_rng(0)
     half = rng.normal([4.0, 0.0, 0.0], size=(min(ways, len(names)) // 6 + 6, 3))
     template = np.concatenate([half, half * (-1.0, 1.0, 1.0)])
     triangles = np.arange(len(half) - 2)[:, None] + np.arange(3)
     faces = np.concatenate([triangles, triangles[:, ::-1] + len(half)]).astype(np.int32)
     source, target = project.folder / shapes.output, make_folder(folder / shapes.output)
-    for name in names:
-        if not source.is_dir() or (source / f"{name}{CorrespondRecord.SURFACE}").is_file():
-            vertices = template + 0.1 * rng.normal(size=template.shape)
-            write_mesh(target / f"{name}{CorrespondRecord.SURFACE}", Mesh(vertices, faces))
+    for name in sorted(_surface_names(project, shapes)) if source.is_dir() else names:
+        vertices = template + 0.1 * rng.normal(size=template.shape)
+        write_mesh(target / f"{name}{CorrespondRecord.SURFACE}", Mesh(vertices, faces))
     if (source / CorrespondenceRecord.FILE).is_file():
         shutil.copyfile(source / CorrespondenceRecord.FILE, target / CorrespondenceRecord.FILE)
 
