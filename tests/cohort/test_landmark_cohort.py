@@ -166,6 +166,10 @@ def test_landmarks_of_surfaces_are_a_cohort_beside_that_of_the_surfaces(tmp_path
     assert np.allclose(again.coefficients, cohort.coefficients)
     with pytest.raises(InputError, match="no landmarks are known on these surfaces"):
         landmark_cohort(surfaces)
+    write_landmark_indices(tmp_path / "others.csv", {f"m{k}": 39 - k for k in range(4)})
+    others = CohortConfig(geometry="landmarks", landmarks=tmp_path / "others.csv")
+    own = [np.linalg.norm(x[36:] - x[36:].mean(axis=0)) for x in shapes]
+    assert np.allclose(read_cohort(tmp_path / "people.csv", others).sizes_mm, own, rtol=1e-6)
     onto = read_cohort(tmp_path / "people.csv", CohortConfig(geometry="landmarks"), onto=cohort)
     assert np.allclose(onto.vertices(2), cohort.vertices(2), atol=1e-4)
 

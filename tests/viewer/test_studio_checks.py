@@ -12,10 +12,10 @@ from shapespace.cli.command_table import summaries_and_options
 from shapespace.cli.forms import forms
 from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.report.analyses.analysis_report import histogram_part
-from shapespace.schemas import CorrespondRecord
+from shapespace.schemas import CorrespondenceRecord, CorrespondRecord, json_text
 from shapespace.viewer.studio.job_commands import QUESTIONS, OptionLabels, checks, order
 from shapespace.viewer.studio.jobs import Job
-from shapespace.viewer.studio.project import Project
+from shapespace.viewer.studio.project import Project, change_of
 from synthetic_shapes import training_meshes
 
 FORMS = forms(summaries_and_options())
@@ -105,6 +105,24 @@ def problems(project: Project, kind: str, options: dict[str, str]) -> list[str]:
 def test_input_that_the_command_accepts_has_no_problem(project: Project, kind: str) -> None:
     assert problems(project, kind, GOOD[kind]) == []
     assert not list(project.folder.glob(f"{kind}*")) and not (project.folder / "inputs").exists()  # nothing is written
+
+
+@pytest.mark.parametrize("kind", sorted(set(QUESTIONS) - {"identify"}))
+def test_excluded_specimens_and_missing_values_do_not_keep_a_question_back(project: Project, kind: str) -> None:
+    record = CorrespondenceRecord(
+        template="x", vertices=150, rounds=[], corresponding=[f"s{k:02}" for k in range(COUNT)], set_aside={},
+        settings={}, version="1",
+    )  # fmt: skip
+    path = project.folder / "correspondence-1" / record.FILE
+    path.write_text(json_text(record))
+    project.edit(None, change_of({"what": "include", "ids": ["s00", "s01"], "included": False}))
+    excluded = problems(project, kind, GOOD[kind])
+    project.undo(project.revision)
+    project.edit(None, change_of({"what": "cells", "cells": [{"id": "s05", "column": "age", "value": ""}]}))
+    emptied = problems(project, kind, {**GOOD[kind], "--missing": "drop"})
+    project.undo(project.revision)
+    path.unlink()
+    assert excluded == emptied == []
 
 
 @pytest.mark.parametrize(("kind", "options", "words"), BAD)

@@ -537,6 +537,47 @@ def test_specimens_that_are_excluded_are_in_no_result(answered: Done, kind: str)
     assert "correspondence-1" not in made.arguments or kind in QUESTIONS or kind in ("report", "study")
 
 
+def test_a_scan_that_was_corrected_with_other_settings_is_compared_with_these(answered: Done) -> None:
+    project = answered.project
+    edit(project, what="mirror", ids=["anna"], mirrored=True)
+    edit(project, what="points", id="anna", points={"tip": [0.0, 0.0, 1.0]})
+    assert answered.outdated[1] == "specimens"
+    answered.run("redo", {"name": "anna"})
+    model = answered.run("build")
+    assert answered.outdated == {2: "redone", 3: "redone", 4: "redone", 5: "redone"}
+    edit(project, what="points", id="anna", points={"tip": [0.0, 0.0, 2.0]})
+    assert answered.outdated[1] == "landmarks" and answered.outdated[model] == "source"
+    project.undo(project.revision)
+    edit(project, what="mirror", ids=["anna"], mirrored=False)
+    assert answered.outdated[1] == "specimens" and answered.outdated[model] == "source"
+
+
+def test_a_question_about_landmarks_uses_those_that_the_user_placed_on_the_surfaces(answered: Done) -> None:
+    options = {"--formula": "~ group", "--geometry": "landmarks"}
+    edit(answered.project, what="landmarks", landmarks={"tip": 1, "base": 2, "side": 0}, on="correspondence-1")
+    number = answered.run("compare", options)
+    table = f"inputs/{number:04d}-landmarks.csv"
+    assert f"landmarks={table}" in answered.jobs[-1].arguments
+    assert "tip,1" in (answered.project.folder / table).read_text() and number not in answered.outdated
+    edit(answered.project, what="landmarks", landmarks={"tip": 3, "base": 2, "side": 0}, on="correspondence-1")
+    assert answered.outdated[number] == "landmarks"
+    edit(answered.project, what="landmarks", landmarks={"tip": 3}, on="correspondence-9")
+    with pytest.raises(InputError, match="were placed on correspondence-9; place them on correspondence-1"):
+        answered.run("compare", options)
+
+
+@pytest.mark.parametrize("change", [{"what": "set", "set": "new"}, {"what": "remove"}])
+def test_specimens_that_are_moved_to_the_new_scans_or_removed_are_not_in_the_next_model(
+    answered: Done, change: dict[str, str]
+) -> None:
+    edit(answered.project, **change, ids=["anna"])
+    assert answered.outdated == {2: "specimens", 3: "specimens", 4: "specimens", 5: "source"}
+    made = order(answered.project, answered.jobs, answered.forms, "build", {}, None, 6)
+    assert {Path(word).name for word in made.arguments if "/" in word} == {
+        f"{name}{CorrespondRecord.SURFACE}" for name in ("ben", "carl")
+    }
+
+
 def test_fits_of_excluded_specimens_are_not_exported(answered: Done) -> None:
     project = answered.project
     for k, name in enumerate(("dora", "emil")):

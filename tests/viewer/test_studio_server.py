@@ -23,6 +23,7 @@ from viewer_world import enter, sentence, served, unpacked
 from shapespace.cli.command_table import summaries_and_options
 from shapespace.cli.forms import forms
 from shapespace.errors import FileError
+from shapespace.io.files import make_folder
 from shapespace.viewer import serve
 from shapespace.viewer.guard import Access
 from shapespace.viewer.studio import run_job
@@ -118,6 +119,17 @@ def test_a_scan_that_is_replaced_under_its_path_is_checked_and_pictured_again(tm
         again = until(client, lambda now: now["specimens"][0]["state"] == "ready")["specimens"][0]
         assert again["extent"] > 10 * first["extent"]
         assert client.get("/api/thumbnails/s0").content[8:12] == b"WEBP"
+
+
+def test_scans_of_one_name_size_and_time_in_different_folders_are_checked_each(tmp_path: Path) -> None:
+    with studio(tmp_path / "p") as client:
+        for k in (1, 2):  # as an archive with a folder for each subject is unpacked
+            scan = tetrahedron(make_folder(tmp_path / f"P{k}") / "face.ply", float(k))
+            os.utime(scan, (1_700_000_000, 1_700_000_000))
+            client.post("/api/import", json={"path": str(scan.parent), "set": "training", "copy": False})
+        now = until(client, lambda now: all(specimen["state"] == "ready" for specimen in now["specimens"]))
+        first, second = now["specimens"]
+        assert first["scan"] != second["scan"] and second["extent"] == pytest.approx(2 * first["extent"], rel=1e-3)
 
 
 def test_a_usable_scan_is_never_excluded_however_often_its_check_is_asked_for(tmp_path: Path) -> None:

@@ -213,7 +213,7 @@ def read_cohort(
         config = CohortConfig(**stated)
     config = config or CohortConfig()
     cohort = _read_shapes(data, config, onto, on_shape)
-    if config.landmarks is not None:
+    if config.landmarks is not None and config.geometry != "landmarks":
         cohort = replace(cohort, landmarks=_landmarks_of(Path(config.landmarks), cohort.n_vertices))
     if config.subject is not None:
         columns = {**cohort.table.columns, SUBJECT: cohort.table.texts(config.subject)}
@@ -263,7 +263,9 @@ def _read_shapes(
             )
             surfaces = replace(surfaces, notes=(*surfaces.notes, note))
         listed = (source if source.is_dir() else source.parent) / _LANDMARKS
-        if surfaces.landmarks is None and listed.is_file():
+        if config.landmarks is not None:
+            surfaces = replace(surfaces, landmarks=_landmarks_of(Path(config.landmarks), surfaces.n_vertices))
+        elif surfaces.landmarks is None and listed.is_file():
             surfaces = replace(surfaces, landmarks=read_surface_landmarks(listed))
         return replace(landmark_cohort(surfaces, onto), review=surfaces.review)
     table = given or (None if data.is_dir() else read_table(data))

@@ -165,7 +165,7 @@ class OpenProject:
                 "id": specimen.id, "file": specimen.file, "set": specimen.role, "included": specimen.included,
                 "unit": specimen.unit, "mirrored": specimen.mirrored, "groomed": bool(specimen.original),
                 "cells": specimen.cells, "points": specimen.points,
-                "scan": scan_key(project.path(specimen)),
+                "scan": scan_key(project.path(specimen), project.folder),
                 **{key: fact for key, fact in facts.items() if key not in ("profile", "content")},
                 "findings": [{**finding, "text": self._sentence(finding["text"])} for finding in facts["findings"]],
             })  # fmt: skip

@@ -167,14 +167,8 @@ def order(
     if kind == "build":
         before = result_of(jobs, CORRESPONDENCES, on)
         output = f"model-{number}.h5"
-        marks, files = tuple[str, ...](), dict[str, str]()
-        if state.landmarks and "--landmarks" not in options:
-            if state.landmarks_on not in ("", before.output):
-                raise InputError(
-                    f"The landmarks were placed on {state.landmarks_on}; place them on {before.output}, or remove them."
-                )
-            marks = ("--landmarks", f"{stem}-landmarks.csv")
-            files[marks[1]] = project.landmark_table(before.output)
+        files = {} if "--landmarks" in options else _landmark_files(project, before.output, stem)
+        marks = ("--landmarks", *files) if files else ()
         return Order((*words, *_surfaces(project, before), "-o", output, *marks, *given), output, files=files)
     if kind == "quality":
         output = f"quality-{number}"
@@ -291,8 +285,29 @@ def _question(project: Project, shapes: Job, forms: Forms, kind: str, options: M
             output, on=shapes.number, files=files,
         )  # fmt: skip
     files = {f"{stem}.csv": project.table(_require_specimens(chosen, "to analyse", 2))}
+    if options.get("--geometry") == "landmarks" and not options.get("--landmarks") and shapes.kind in CORRESPONDENCES:
+        marks = _landmark_files(project, shapes.output, stem)
+        files |= marks
+        given += [word for name in marks for word in ("--set", f"landmarks={name}")]
     arguments = (*words, f"{stem}.csv", "--shapes", shapes.output, "-o", output, *given)
     return Order(arguments, output, on=shapes.number, files=files)
+
+
+def _landmark_files(project: Project, surfaces: str, stem: str) -> dict[str, str]:
+    """Return the path and the content of the table of the landmarks that the user placed on surfaces, and of those of
+    their scans; empty if the user placed none.
+
+    Raises:
+        InputError: they were placed on other surfaces.
+    """
+    state = project.state
+    if not state.landmarks:
+        return {}
+    if state.landmarks_on not in ("", surfaces):
+        raise InputError(
+            f"The landmarks were placed on {state.landmarks_on}; place them on {surfaces}, or remove them."
+        )
+    return {f"{stem}-landmarks.csv": project.landmark_table(surfaces)}
 
 
 def shapes_of(jobs: Sequence[Job], kind: str, on: int | None) -> Job:
@@ -366,7 +381,7 @@ def checks(
         shapes: job whose shapes a question is about; None for other kinds.
         odd: sentences on specimens that differ from the others.
     """
-    chosen = _specimens_of(project, shapes)
+    listed = chosen = _specimens_of(project, shapes)
     columns = _used_columns(project.state.columns, options)
     missing = {column: sum(not specimen.cells.get(column) for specimen in chosen) for column in columns}
     of_all = len(chosen)
@@ -426,7 +441,7 @@ def checks(
         if text:
             found.append({"level": "problem", "text": text})
     if not any(finding["level"] == "problem" for finding in found):
-        reason = _reason_of_rejection(project, forms, kind, options, shapes, [specimen.id for specimen in chosen])
+        reason = _reason_of_rejection(project, forms, kind, options, shapes, [specimen.id for specimen in listed])
         for column in columns if reason else ():
             is_group = column in (options.get("--group"), options.get("--points"))
             if is_group and len(chosen) == len({specimen.cells.get(column) for specimen in chosen}):
@@ -469,18 +484,17 @@ def _reason_of_rejection(
 
 
 def _write_small_surfaces(project: Project, shapes: Job, names: Sequence[str], folder: Path, ways: int) -> None:
-    """Write small symmetric surfaces, which vary in `ways` ways, into `folder`: for each name that has one in `shapes`,
-    or all if `shapes` has no folder, with its record."""
+    """Write small symmetric surfaces, which vary in `ways` ways, into `folder`: for each specimen that has one in
+    `shapes`, also if it was excluded, as the record lists it; or for all `names` if `shapes` has no folder."""
     rng = np.random.default_rng(0)
     half = rng.normal([4.0, 0.0, 0.0], size=(min(ways, len(names)) // 6 + 6, 3))
     template = np.concatenate([half, half * (-1.0, 1.0, 1.0)])
     triangles = np.arange(len(half) - 2)[:, None] + np.arange(3)
     faces = np.concatenate([triangles, triangles[:, ::-1] + len(half)]).astype(np.int32)
     source, target = project.folder / shapes.output, make_folder(folder / shapes.output)
-    for name in names:
-        if not source.is_dir() or (source / f"{name}{CorrespondRecord.SURFACE}").is_file():
-            vertices = template + 0.1 * rng.normal(size=template.shape)
-            write_mesh(target / f"{name}{CorrespondRecord.SURFACE}", Mesh(vertices, faces))
+    for name in sorted(_surface_names(project, shapes)) if source.is_dir() else names:
+        vertices = template + 0.1 * rng.normal(size=template.shape)
+        write_mesh(target / f"{name}{CorrespondRecord.SURFACE}", Mesh(vertices, faces))
     if (source / CorrespondenceRecord.FILE).is_file():
         shutil.copyfile(source / CorrespondenceRecord.FILE, target / CorrespondenceRecord.FILE)
 
@@ -508,15 +522,15 @@ def outdated_results(
         sources = [other for other in earlier if other.output in paths[job.number]]
         redone = [other for other in done if other.kind == "redo" and other.number > job.number]
         has_outdated_source = any(source.number in found for source in sources)
-        read = dict(job.scans)
-        for other in redone:
-            read |= other.scans if other.output == job.output else {}
+        read, own = dict(job.scans), [other for other in redone if other.output == job.output]
+        for other in own:
+            read |= other.scans
         if job.kind != "redo" and any(present.get(name, key) != key for name, key in read.items()):
             found[job.number] = "specimens"
         elif (
             job.kind in (*_STUDY, "report", "export", "landmarks")
             and not (job.kind == "redo" or (job.kind == "report" and "--specimens" not in job.arguments))
-            and (change := _change_since(project, earlier, forms, job, sources))
+            and (change := _change_since(project, earlier, forms, job, sources, own))
             and not (job.kind == "report" and change == "specimens" and has_outdated_source)
         ):
             found[job.number] = change
@@ -532,30 +546,41 @@ def _keys_of(specimens: Sequence[Specimen], scans: Mapping[str, str]) -> dict[st
 
 
 def _change_since(
-    project: Project, earlier: Sequence[Job], forms: Forms, job: Job, sources: Sequence[Job]
+    project: Project, earlier: Sequence[Job], forms: Forms, job: Job, sources: Sequence[Job], redone: Sequence[Job]
 ) -> Outdated | None:
     on = job.on if job.on is not None or not sources or job.kind == "report" else sources[-1].number
     try:
         now = order(project, earlier, forms, job.kind, job.options, on, job.number)
     except (InputError, FileError):
-        moved = job.kind == "build" and bool(sources) and project.state.landmarks_on not in ("", sources[-1].output)
+        has_marks = job.kind == "build" or job.options.get("--geometry") == "landmarks"
+        moved = has_marks and bool(sources) and project.state.landmarks_on not in ("", sources[-1].output)
         return "landmarks" if moved else "specimens"
     is_each = job.kind in ("correspond", "fit", "complete")  # each scan has a result, also if others are excluded later
     if now.arguments != job.arguments and job.kind != "report":
-        has_marks = ["--landmarks" in arguments for arguments in (now.arguments, job.arguments)]
-        return "landmarks" if has_marks[0] != has_marks[1] else "specimens"
+        are_marked = ["-landmarks.csv" in " ".join(arguments) for arguments in (now.arguments, job.arguments)]
+        return "landmarks" if are_marked[0] != are_marked[1] else "specimens"
+    numbers = {str(other.options.get("name")): other.number for other in redone}  # of the job that read a scan last
     for name, content in now.files.items():
         try:
-            before = (project.folder / name).read_text(encoding="utf-8")
+            number = numbers.get(Path(name).stem, job.number) if f"{job.number:04d}-landmarks/" in name else job.number
+            before = (project.folder / name.replace(f"{job.number:04d}", f"{number:04d}", 1)).read_text(
+                encoding="utf-8"
+            )
         except OSError:
             continue  # the file was removed, so there is nothing to compare
         if name.startswith(f"{_INPUTS}/{job.number:04d}-landmarks"):
             if content != before:
                 return "landmarks"
         elif is_each:
-            if _cells_of(content, "file") - _cells_of(before, "file"):
+            listed, listed_before = _scans_of(content, job.number), _scans_of(before, job.number)
+            for other in redone:
+                with suppress(OSError):
+                    path = project.folder / f"{_INPUTS}/{other.number:04d}.csv"
+                    listed_before |= _scans_of(path.read_text(encoding="utf-8"), other.number)
+            pairs = [(cells, listed_before.get(name, ("", ""))) for name, cells in listed.items()]
+            if any(cells[0] != cells_before[0] for cells, cells_before in pairs):
                 return "specimens"
-            if _cells_of(content, LANDMARK_COLUMN) - _cells_of(before, LANDMARK_COLUMN):
+            if any(cells != cells_before for cells, cells_before in pairs):
                 return "landmarks"
         elif name.endswith(".csv"):
             columns = {*project.state.columns, *next(csv.reader(io.StringIO(before)))}
@@ -568,9 +593,18 @@ def _change_since(
     return None
 
 
-def _cells_of(scans: str, column: str) -> set[tuple[str, str]]:
-    """Return the ids and the cells of a column of a list of scans; cells of a column that it lacks are empty."""
-    return {(row["id"], row.get(column, "")) for row in csv.DictReader(io.StringIO(scans))}
+def _scans_of(scans: str, number: int) -> dict[str, tuple[str, str]]:
+    """Return id -> file of the scan and of its landmarks, in a list of scans that the job with this number reads.
+
+    The number is removed from files that were written for the job. A file of landmarks is empty without landmarks.
+    """
+    return {
+        row["id"]: (
+            row["file"].removeprefix(f"{number:04d}-"),
+            row.get(LANDMARK_COLUMN, "").removeprefix(f"{number:04d}-"),
+        )
+        for row in csv.DictReader(io.StringIO(scans))
+    }
 
 
 @lru_cache(maxsize=256)
@@ -621,23 +655,39 @@ def _require_specimens(specimens: Sequence[Specimen], purpose: str, least: int) 
 
 
 def _surfaces(project: Project, before: Job) -> list[str]:
-    """Return the folder in correspondence, or the surfaces of the included specimens if others are excluded."""
-    excluded = [specimen for specimen in project.state.specimens if not specimen.included]
-    if not _surface_files(project, before, excluded):
+    """Return the folder in correspondence, or the surfaces of the included training specimens if it has others.
+
+    A surface without a specimen is that of a removed one, unless a specimen without a surface may be a renamed one.
+    """
+    chosen = project.state.chosen("training")
+    included, there = _surface_files(project, before, chosen), _surface_names(project, before)
+    others = there.intersection(specimen.id for specimen in project.state.specimens).difference(included)
+    if len(included) == len(chosen):
+        others = there.difference(included)
+    if not others:
         return [before.output]
-    included = _surface_files(project, before, project.state.chosen("training"))
     if len(included) < 2:
         raise InputError("Fewer than two included specimens are in correspondence; include more.")
     return list(included.values())
 
 
+def _surface_names(project: Project, shapes: Job) -> set[str]:
+    """Return the names of the specimens with a surface in correspondence."""
+    with suppress(FileNotFoundError):
+        names = [path.name for path in (project.folder / shapes.output).iterdir()]
+        ending = CorrespondRecord.SURFACE
+        return {name.removesuffix(ending) for name in names if name.endswith(ending)}
+    return set()
+
+
 def _surface_files(project: Project, shapes: Job, specimens: Sequence[Specimen]) -> dict[str, str]:
     """Return id -> path in the project's folder of the surface in correspondence, of the specimens that have one."""
-    files = {specimen.id: f"{specimen.id}{CorrespondRecord.SURFACE}" for specimen in specimens}
-    with suppress(FileNotFoundError):
-        there = {entry.name for entry in os.scandir(project.folder / shapes.output)}
-        return {name: f"{shapes.output}/{file}" for name, file in files.items() if file in there}
-    return {}
+    there = _surface_names(project, shapes)
+    return {
+        specimen.id: f"{shapes.output}/{specimen.id}{CorrespondRecord.SURFACE}"
+        for specimen in specimens
+        if specimen.id in there
+    }
 
 
 def _model_ending(name: str) -> str:

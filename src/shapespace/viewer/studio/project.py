@@ -889,13 +889,18 @@ def _count_text(ids: Iterable[str]) -> str:
     return names[0] if len(names) == 1 else f"{len(names)} specimens"
 
 
-def scan_key(scan: Path) -> str:
-    """Return a key that changes with a scan: that of its name, size and time of change."""
+def scan_key(scan: Path, folder: Path) -> str:
+    """Return a key that changes with a scan: that of its path, size and time of change.
+
+    Scans in the project's `folder`, which may be moved, are identified by their path in it, others by their complete
+    path: those of an archive can have the same name, size and time in different folders.
+    """
+    place = scan.relative_to(folder).as_posix() if scan.is_relative_to(folder) else str(scan)
     try:
         stat = scan.stat()
-        text = f"{scan.name}|{stat.st_size}|{stat.st_mtime_ns}"  # without the folder: projects are moved
+        text = f"{place}|{stat.st_size}|{stat.st_mtime_ns}"
     except OSError:
-        text = f"{scan}|missing"
+        text = f"{place}|missing"
     return hashlib.sha256(text.encode(errors="surrogateescape")).hexdigest()[:24]
 
 

@@ -60,7 +60,7 @@ class SpecimenChecks:
 
     def facts(self, scan: Path) -> dict[str, Any] | None:
         """Return the facts of a scan, or None while it is checked; the first call asks for the check."""
-        key = scan_key(scan)
+        key = scan_key(scan, self._folder.parent)
         if key in self._known:
             return self._known[key]
         try:
@@ -76,7 +76,7 @@ class SpecimenChecks:
 
     def picture(self, scan: Path) -> Path:
         """Return the path of the picture of a scan, which exists once it was checked and is usable."""
-        return self._folder / f"{scan_key(scan)}.webp"
+        return self._folder / f"{scan_key(scan, self._folder.parent)}.webp"
 
     def surface(self, scan: Path, *, mirrored: bool) -> Future[bytes]:
         """Return the packed surface of a scan for a view, as it is in its file or reflected at x = 0.
