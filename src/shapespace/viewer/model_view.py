@@ -82,7 +82,7 @@ class ModelView:
                 raise InputError(f"{path} is not a folder of fits; omit --model, or give the folder.")
             if path.exists() and not looks_like_model(path):
                 raise InputError(
-                    f"{path} is no model (.h5) and no folder; give the model, or the folder that shapespace fit wrote."
+                    f"{path} is no model (.h5) and no folder; give a model, a folder of results, a report or a project."
                 )
             return ModelView(ShapeModel.load(path), path.name)
         folder = Folder(path)

@@ -33,6 +33,10 @@
     }
     shown.append(list.parentElement, main, ...page.querySelectorAll("script[type='application/octet-stream']"));
     for (const element of shown.querySelectorAll(NOT_SHOWN)) element.remove();
+    for (const element of shown.querySelectorAll("*")) {
+      for (const name of element.getAttributeNames()) if (/^(on.*|style|ping|formaction|action)$/i.test(name)) element.removeAttribute(name);
+    }
+    for (const link of shown.querySelectorAll("a[href]:not([href^='#'])")) Object.assign(link, { target: "_blank", rel: "noopener noreferrer" });
     return shown;
   }
 

@@ -7,7 +7,7 @@ import json
 import threading
 import zipfile
 from collections.abc import AsyncGenerator, Callable, Generator, Mapping
-from contextlib import ExitStack, aclosing
+from contextlib import ExitStack, aclosing, suppress
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, cast
@@ -71,7 +71,7 @@ from shapespace.viewer.studio.project import (
     with_cells,
     with_points,
 )
-from shapespace.viewer.studio.specimen_checks import SpecimenChecks
+from shapespace.viewer.studio.specimen_checks import SpecimenChecks, content_hash
 from shapespace.viewer.studio.views import Views, result_path, view_kinds
 
 _VOLUME_ENDINGS = tuple(ending for ending in VOLUME_ENDINGS if ending != ".mhd")  # whose data are in another file
@@ -141,12 +141,17 @@ class OpenProject:
             self._odd = key, {key[k][0]: odd for k, odd in found.items()}
         return self._odd[1]
 
-    def scan_contents(self) -> dict[str, str]:
-        """Return the hash of the scan of each specimen by its id, of those that were checked."""
+    def scan_contents(self, *, unchecked: bool = False) -> dict[str, str]:
+        """Return the hash of the scan of each specimen by its id, of those that were checked or also of the others."""
         checked = {
             specimen.id: self.checks.facts(self.project.path(specimen)) for specimen in self.project.state.specimens
         }
-        return {name: facts["content"] for name, facts in checked.items() if facts and "content" in facts}
+        contents = {name: facts["content"] for name, facts in checked.items() if facts and "content" in facts}
+        for specimen in self.project.state.specimens if unchecked else ():
+            if specimen.id not in contents:
+                with suppress(FileError):  # which the command reports
+                    contents[specimen.id] = content_hash(self.project.path(specimen))
+        return contents
 
     def facts(self) -> dict[str, Any]:
         """Return the state for the page."""
@@ -476,9 +481,11 @@ class Studio:
             raise HTTPException(400, "A job needs options, and perhaps the number of another.")
         opened = self._project
 
+        scans = await run_in_threadpool(opened.scan_contents, unchecked=True)
+
         def make(number: int, before: list[Job]) -> Order:
             given = cast(dict[str, Any], options)
-            return order(opened.project, before, self._forms, kind, given, on, number, opened.scan_contents())
+            return order(opened.project, before, self._forms, kind, given, on, number, scans)
 
         job = await run_in_threadpool(opened.jobs.add, kind, make, cast(dict[str, Any], options))
         return json_response({"number": job.number}, 201)

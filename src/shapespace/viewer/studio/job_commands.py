@@ -66,7 +66,7 @@ _OPTION = re.compile(
     r"(?: \([a-z]+_[a-z_]+\))?(?:(?P<equals>[ =])(?P<word>(?!out\b)\w[\w.,=-]*(?<![.,])))?(?P<end>(?=[.;:,)<\"\n]|$))?"
 )
 """An option or setting, and its value or the next word."""
-_MARKUP = re.compile(r"<(script|style|pre|code)\b.*?</\1>|<[^>]*>|[^<]+", re.DOTALL)
+_MARKUP = re.compile(r"<(script|style|pre|code)\b.*?(?:</\1>|\Z)|<[^>]*>|[^<]+", re.DOTALL)
 """A part of an HTML page: code, a tag, or text."""
 
 

@@ -29,14 +29,15 @@ def is_landmark_table(content: bytes, name: str, state: State) -> bool:
         FileFormatError: landmarks that cannot be read.
     """
     try:
-        header = next(table_rows(content), list[str]())
+        header, *rows = [*table_rows(content)] or [list[str]()]
     except ValueError:
         return False  # the reader of tables reports the problem
     kind = header_kind(header)
     if kind in ("wide", "long"):
         return parse_table(content, Path(name)).dimensions == 3
     has_rows = kind == "single" or (len(header) == 4 and all(map(is_number, header[1:])))
-    return has_rows and _is_known(Path(name).stem, state)
+    has_specimens = any(row and _is_known(row[0], state) for row in rows)
+    return has_rows and not has_specimens and _is_known(Path(name).stem, state)
 
 
 def points_of_file(

@@ -168,6 +168,15 @@ def _load_code() -> None:
         mesh_still(repaired)
 
 
+def content_hash(scan: Path) -> str:
+    """Return the hash of the content of a scan.
+
+    Raises:
+        FileError: it cannot be read.
+    """
+    return sha256_of_file(scan)[:_KEY]
+
+
 def check_scan(scan: Path, stem: Path) -> dict[str, Any]:
     """Write the facts and the picture of a scan next to `stem`, and return the facts."""
     try:
@@ -188,7 +197,7 @@ def check_scan(scan: Path, stem: Path) -> dict[str, Any]:
     except ShapespaceError as error:
         facts = _unusable(_without_folder(error, scan))
     with contextlib.suppress(ShapespaceError):  # of a file that cannot be read, which is a finding
-        facts["content"] = sha256_of_file(scan)[:_KEY]
+        facts["content"] = content_hash(scan)
     write_text(stem.with_suffix(".json"), json.dumps(facts))
     return facts
 
