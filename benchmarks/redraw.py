@@ -34,11 +34,12 @@ FLAGS += ["--disable-quic", "--no-first-run", "--disable-background-networking",
 
 # Whole: from the event to pixels that were read back. Drag, below, ends where the picture is handed to the browser.
 SCRIPT = """async ([repeat, map]) => {
-  const box = document.getElementById("map");
+  const root = document.querySelector("[data-testid=pane]").shadowRoot;
+  const box = root.getElementById("map");
   if (box.checked !== map) box.click();
   const view = window.shapespaceStage.a;
   const move = (k, value) => {
-    const slider = document.querySelector('[data-testid=pane]').shadowRoot.getElementById(`mode-${k + 1}`);
+    const slider = root.getElementById(`mode-${k + 1}`);
     slider.value = value;
     slider.dispatchEvent(new Event("input", { bubbles: true }));
   };
@@ -109,14 +110,14 @@ def measure(repeat: int) -> dict[str, object]:
                 page = browser.new_page(viewport={"width": 1280, "height": 800})
                 start = time.perf_counter()
                 page.goto(address)
-                page.wait_for_selector("body[data-ready]")
+                page.wait_for_selector("[data-testid=pane][data-ready]")
                 opened = time.perf_counter() - start
                 page.wait_for_timeout(1500)
                 asked: list[str] = []
                 page.on("request", lambda request: asked.append(request.url))
                 plain = page.evaluate(SCRIPT, [repeat, False]) | drag(page, repeat)
                 painted = page.evaluate(SCRIPT, [repeat, True]) | drag(page, repeat)
-                facts = page.evaluate("document.getElementById('about').textContent")
+                facts = page.get_by_test_id("facts").inner_text()
                 browser.close()
         finally:
             server.terminate()
