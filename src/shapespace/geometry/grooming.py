@@ -103,7 +103,7 @@ def _crop_error(text: str) -> InputError:
 
 @dataclass(frozen=True)
 class Grooming:
-    """What is removed from scans and added to them, in the order of these fields; coordinates stay as they are.
+    """Steps that remove or add parts of scans, applied in the order of these fields; coordinates do not change.
 
     Args:
         crop: write only the part inside `sphere:X,Y,Z,RADIUS` or `box:X,Y,Z,X,Y,Z`, outside a sphere

@@ -8,7 +8,7 @@
     before: "Before: centroids together", initial: "After phase 1: the pose", final: "After phase 2: pose and shape",
     dense: "Dense: the rest of the way to the scan",
   };
-  const NEARER = (Viewer.NEARER = "the nearer one is shown");
+  const NEARER = "the nearer one is shown";
   const REGIONS = { followed: "followed", rejected: "rejected as not matching", border: "at the scan's border", unseen: "not shown by the scan" };
   const REGION_CODES = ["followed", "rejected", "border", "unseen"];
 

@@ -13,7 +13,7 @@
     report: ["scene", "report"],
   };
   const STYLES = { surfaces: ["widgets", "viewer"], model: ["widgets", "uPlot.min", "viewer"], report: ["report", "widgets"] };
-  // What a report has beside its data and its words: it is read from a file, and must not act in the page.
+  // Elements of a report that could act in the page; reports are read from files.
   const NOT_SHOWN = "script:not([type='application/octet-stream']), style, link, meta, base, iframe, frame, object, embed, form";
 
   /** The navigation and the sections of a report; of an answer first maps and charts that turn, as its sentences are above it already. */
@@ -53,13 +53,13 @@
     return `#${screen}${query && `?${query.replace(/%2C/g, ",").replace(/%3A/g, ":")}`}`;
   };
 
-  /** Write what is shown into the address, without a step of the browser's history. */
+  /** Write the view into the address, without a new entry in the history of the browser. */
   Studio.keepPlace = (values) => {
     const { screen, place } = Studio.place();
     history.replaceState(null, "", addressOf(screen, { question: place.question, ...values }));
   };
 
-  /** Go to a screen as a step of the browser's history. */
+  /** Go to a screen, with a new entry in the history of the browser. */
   Studio.goTo = (screen, values = {}) => { location.hash = addressOf(screen, values); };
 
   // Panes -----------------------------------------------------------------------------------------------------------

@@ -47,7 +47,7 @@
   function Coordinates({ specimen, name, onmove }) {
     const point = sent.get(`${specimen.id}/${name}`) || specimen.points[name];
     const [draft, setDraft] = useState(null);
-    const typing = useRef(false); // whether the draft is not sent yet; an answer to what was sent must not end it
+    const typing = useRef(false); // whether the draft is unsent: the answer to an earlier edit must not discard it
     useEffect(() => { typing.current = false; setDraft(null); }, [name]);
     useEffect(() => { if (!typing.current) setDraft(null); }, [String(point)]);
     const change = (values) => { typing.current = true; setDraft(values); };

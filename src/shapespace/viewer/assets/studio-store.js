@@ -13,7 +13,7 @@
     state: null, // of /api/project
     forms: {}, // of /api/forms
     volumes: [], // uploaded label volumes whose labels are not chosen yet: {file, name, set}
-    uploads: { total: 0, done: 0, added: 0, notes: [] },
+    uploads: null, // of the last drop
     changed: () => {}, // draws the page
   });
 
@@ -167,9 +167,13 @@
   const waiting = [];
   let workers = 0;
 
+  /** Forget the uploads that have ended, and their notes. */
+  function clearUploads() { Studio.uploads = { total: 0, done: 0, added: 0, notes: [] }; }
+  clearUploads();
+
   /** Add scans, three at a time; tables and landmarks follow, as they name the scans. `only`: the kind of all files. */
   function upload(files, set, only) {
-    if (!uploading()) Studio.uploads = { total: 0, done: 0, added: 0, notes: [] };
+    if (!uploading()) clearUploads();
     files.sort((a, b) => byName(a.name, b.name));
     const { formats, landmark_formats: ofLandmarks, volume_formats: ofVolumes } = Studio.state;
     const kindOf = ({ name }) => only || (ending(name, TABLES) ? "table" : ending(name, ofVolumes) ? "volume" : !ending(name, formats) && ending(name, ofLandmarks) ? "landmarks" : "");
@@ -235,5 +239,5 @@
   const newestOfEach = (jobs) => Array.from(new Map([...jobs].reverse().map((job) => [JSON.stringify([job.kind, job.on, job.options]), job])).values()).reverse();
   const isActive = (job) => job.status === "running" || job.status === "waiting";
 
-  Object.assign(Studio, { ask, json, post, refresh, listen, act, edit, editBy, runFigures, undo, redo, runJob, upload, uploading, filesOfDrop, jobsOf, newest, newestOfEach, isActive });
+  Object.assign(Studio, { clearUploads, ask, json, post, refresh, listen, act, edit, editBy, runFigures, undo, redo, runJob, upload, uploading, filesOfDrop, jobsOf, newest, newestOfEach, isActive });
 })();

@@ -46,7 +46,6 @@
     const close = async (used) => {
       const files = volumes.map((volume) => volume.file).filter((file) => !used.includes(file));
       Studio.volumes = [];
-      if (!Studio.uploads.added && !Studio.uploads.notes.length) Studio.uploads = { total: 0, done: 0, added: 0, notes: [] };
       Studio.changed();
       if (files.length) await Studio.json("/api/volumes", { ...Viewer.post({ files }), method: "DELETE" });
     };

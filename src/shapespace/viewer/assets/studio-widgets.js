@@ -67,7 +67,7 @@
         ${notes.length > 0 && html`<details open=${notes.length <= 3}><summary>${T.count(notes.length, "note")}</summary>
           <ul data-testid="upload-notes">${notes.slice(0, 200).map((note) => html`<li>${note}</li>`)}</ul></details>`}
         ${!Studio.uploading() && Studio.volumes.length > 0 && html`<${Studio.VolumeLabels} volumes=${Studio.volumes} />`}
-        ${!Studio.uploading() && html`<${Button} small testid="uploads-close" onclick=${() => { Studio.uploads = { total: 0, done: 0, added: 0, notes: [] }; Studio.changed(); }}>${T.close}<//>`}
+        ${!Studio.uploading() && html`<${Button} small testid="uploads-close" onclick=${() => { Studio.clearUploads(); Studio.changed(); }}>${T.close}<//>`}
       </div>`;
   }
 

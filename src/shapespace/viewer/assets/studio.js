@@ -25,7 +25,7 @@
     return jobs.some((job) => job.status === "done") ? "done" : null;
   }
 
-  /** The number of steps through the addresses of this page; each shows its screen anew. */
+  /** Number of changes of the address; the screen is drawn anew after each. */
   function useVisit() {
     const [visit, setVisit] = useState(0);
     useEffect(() => {

@@ -119,7 +119,7 @@
       placed();
     }
 
-    /** Tell the owner of the address that it changed. */
+    /** Report a change of the view, for the address. */
     const placed = () => options.onplace?.();
 
     /** A mark follows the pointer that takes it, on all surfaces at once. */

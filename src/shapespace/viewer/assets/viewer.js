@@ -1,4 +1,4 @@
-/* A model, and fits by it: the tabs Model, Compare and Fits beside one stage. */
+/* A model and its fits: the tabs Model, Compare and Fits, which share one stage. */
 (function () {
   "use strict";
 

@@ -127,27 +127,34 @@ class OpenProject:
         job = next((job for job in self.jobs.all() if job.number == number and job.status == "done"), None)
         return None if job is None else result_path(self.project.folder, job.output)
 
-    def odd_scans(self) -> dict[str, OddScan]:
-        """Return the included specimens that differ from the others in size or shape, by their ids."""
-        included = [specimen for specimen in self.project.state.specimens if specimen.included]
-        facts = [self.checks.facts(self.project.path(specimen)) or {} for specimen in included]
+    def _checked(self) -> dict[str, dict[str, Any]]:
+        """Return the facts of the scan of each specimen by its id, of those that were checked."""
+        project = self.project
+        facts = {specimen.id: self.checks.facts(project.path(specimen)) for specimen in project.state.specimens}
+        return {name: found for name, found in facts.items() if found is not None}
+
+    def odd_scans(self, checked: Mapping[str, Mapping[str, Any]] | None = None) -> dict[str, OddScan]:
+        """Return the included specimens that differ from the others in size or shape, by their ids.
+
+        Args:
+            checked: facts of the scans that were checked (default: read again).
+        """
+        facts = self._checked() if checked is None else checked
         key = [
-            (specimen.id, specimen.unit or "mm", fact["size"], fact["profile"])
-            for specimen, fact in zip(included, facts, strict=True) if "profile" in fact
-        ]  # fmt: skip
+            (specimen.id, specimen.unit or "mm", facts[specimen.id]["size"], facts[specimen.id]["profile"])
+            for specimen in self.project.state.specimens
+            if specimen.included and "profile" in facts.get(specimen.id, ())
+        ]
         if key != self._odd[0]:
             measures = [ScanMeasures(size, np.array(profile)) for _, _, size, profile in key]
             found = find_odd_scans(measures, [unit for _, unit, _, _ in key])
             self._odd = key, {key[k][0]: odd for k, odd in found.items()}
         return self._odd[1]
 
-    def scan_contents(self, *, unchecked: bool = False) -> dict[str, str]:
-        """Return the hash of the scan of each specimen by its id, of those that were checked or also of the others."""
-        checked = {
-            specimen.id: self.checks.facts(self.project.path(specimen)) for specimen in self.project.state.specimens
-        }
-        contents = {name: facts["content"] for name, facts in checked.items() if facts and "content" in facts}
-        for specimen in self.project.state.specimens if unchecked else ():
+    def scan_contents(self) -> dict[str, str]:
+        """Return the hash of the scan of each specimen by its id; scans that were not checked yet are read for it."""
+        contents = _contents_of(self._checked())
+        for specimen in self.project.state.specimens:
             if specimen.id not in contents:
                 with suppress(FileError):  # which the command reports
                     contents[specimen.id] = content_hash(self.project.path(specimen))
@@ -157,13 +164,14 @@ class OpenProject:
         """Return the state for the page."""
         jobs, project = self.jobs.all(), self.project  # in this order: a job that is done has changed the state
         state = project.state
-        scans = self.scan_contents()
+        checked = self._checked()
+        scans = _contents_of(checked)
         key = (state, scans, [(job.number, job.status) for job in jobs])
         if key != self._outdated[0]:
             self._outdated = key, outdated_results(project, jobs, self._forms, scans)
         specimens: list[dict[str, Any]] = []
         for specimen in state.specimens:
-            facts = self.checks.facts(project.path(specimen)) or {
+            facts = checked.get(specimen.id) or {
                 "state": "waiting", "vertices": 0, "triangles": 0, "extent": 0.0, "findings": []
             }  # fmt: skip
             specimens.append({
@@ -177,7 +185,7 @@ class OpenProject:
         return {
             "name": state.name, "folder": str(project.folder), "revision": project.revision,
             "columns": list(state.columns), "specimens": specimens,
-            "odd": [{"id": name, "text": odd.text, "unit": odd.unit} for name, odd in self.odd_scans().items()],
+            "odd": [{"id": name, "text": odd.text, "unit": odd.unit} for name, odd in self.odd_scans(checked).items()],
             "notes": state.notes(), "counts": state.counts(),
             "undo": project.undo_text, "redo": project.redo_text, "landmarks": state.landmarks,
             "landmarks_on": state.landmarks_on, "point_names": list(state.point_names),
@@ -202,6 +210,11 @@ class OpenProject:
             # A command that rejected its input would reject it again.
             "can_continue": job.status in ("cancelled", "interrupted") or (job.status == "failed" and job.code != 2),
         }  # fmt: skip
+
+
+def _contents_of(checked: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
+    """Return the hash of each scan from the facts of its check, if they contain it."""
+    return {name: facts["content"] for name, facts in checked.items() if "content" in facts}
 
 
 def _words(folder: Path) -> tuple[list[str], str | None]:
@@ -481,7 +494,7 @@ class Studio:
             raise HTTPException(400, "A job needs options, and perhaps the number of another.")
         opened = self._project
 
-        scans = await run_in_threadpool(opened.scan_contents, unchecked=True)
+        scans = await run_in_threadpool(opened.scan_contents)
 
         def make(number: int, before: list[Job]) -> Order:
             given = cast(dict[str, Any], options)
@@ -500,7 +513,8 @@ class Studio:
             except InputError as error:
                 return json_response([{"level": "problem", "text": str(error)}])
         given = cast(dict[str, Any], options) if isinstance(options, dict) else {}
-        odd = [f"{name}: {odd.text}" for name, odd in opened.odd_scans().items()]
+        odd_scans = opened.odd_scans() if kind == "correspond" else {}
+        odd = [f"{name}: {odd.text}" for name, odd in odd_scans.items()]
         found = await run_in_threadpool(checks, opened.project, self._forms, kind, given, shapes, odd)
         return json_response([{**finding, "text": self._labels.sentence(finding["text"])} for finding in found])
 
