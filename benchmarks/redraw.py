@@ -35,11 +35,12 @@ FLAGS += ["--disable-quic", "--no-first-run", "--disable-background-networking",
 # Whole: from the event to pixels that were read back. Drag, below, ends where the picture is handed to the browser.
 SCRIPT = """async ([repeat, map]) => {
   const root = document.querySelector("[data-testid=pane]").shadowRoot;
-  const box = root.getElementById("map");
+  const find = (name) => root.querySelector(`[data-testid=${name}]`);
+  const box = find("map");
   if (box.checked !== map) box.click();
   const view = window.shapespaceStage.a;
   const move = (k, value) => {
-    const slider = root.getElementById(`mode-${k + 1}`);
+    const slider = find(`mode-${k + 1}`);
     slider.value = value;
     slider.dispatchEvent(new Event("input", { bubbles: true }));
   };
@@ -61,7 +62,7 @@ SCRIPT = """async ([repeat, map]) => {
 
 def drag(page: Any, repeat: int) -> dict[str, Any]:
     """Drag the slider of the second mode by the mouse, and return ms from each event to its picture."""
-    box = page.locator("#mode-2").bounding_box()
+    box = page.get_by_test_id("mode-2").bounding_box()
     y = box["y"] + box["height"] / 2
     page.mouse.move(box["x"] + box["width"] / 2, y)
     page.mouse.down()

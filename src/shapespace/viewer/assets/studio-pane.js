@@ -9,10 +9,10 @@
   // Scripts and style sheets, in this order, which are loaded when they are first needed.
   const SCRIPTS = {
     surfaces: ["scene", "surfaces"],
-    model: ["scene", "uPlot.iife.min", "charts", "coefficients-csv", "fit-controls", "fit-view", "viewer-stage", "viewer-model", "viewer-compare", "viewer-fits", "viewer"],
+    model: ["scene", "charts", "coefficients-csv", "viewer-compare", "viewer-fits", "viewer"],
     report: ["scene", "report"],
   };
-  const STYLES = { surfaces: ["widgets", "viewer"], model: ["widgets", "uPlot.min", "viewer"], report: ["report", "widgets"] };
+  const STYLES = { surfaces: ["widgets", "viewer"], model: ["widgets", "viewer"], report: ["report", "widgets"] };
   // Elements of a report that could act in the page; reports are read from files.
   const NOT_SHOWN = "script:not([type='application/octet-stream']), style, link, meta, base, iframe, frame, object, embed, form";
 

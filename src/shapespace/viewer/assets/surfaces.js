@@ -3,7 +3,8 @@
   "use strict";
 
   const Viewer = window.ShapespaceViewer;
-  const { h, save, alertUser, guarded } = Viewer;
+  const { save, alertUser, guarded } = Viewer;
+  const { make: h } = Shapespace.widgetParts;
   const WORDS = { unreadable: "unreadable", excluded: "excluded", doubtful: "doubtful", look: "needs review", converged: "converged" };
   const DOTS = { unreadable: "unreadable", excluded: "failed", doubtful: "doubtful", look: "doubtful", converged: "converged" };
 
