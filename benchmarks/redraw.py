@@ -60,6 +60,20 @@ SCRIPT = """async ([repeat, map]) => {
 }"""
 
 
+# ms from the first event of a slider to the picture, as drawn.
+TIMES = """() => {
+  const stage = window.shapespaceStage.a;
+  const sliders = document.querySelector("[data-testid=pane]").shadowRoot.querySelector("[data-testid=sliders]");
+  let began = 0;
+  window.times = [];
+  sliders.addEventListener("input", () => { began = began || performance.now(); }, true);
+  stage.on("draw", () => {
+    if (began) window.times.push(performance.now() - began);
+    began = 0;
+  });
+}"""
+
+
 def drag(page: Any, repeat: int) -> dict[str, Any]:
     """Drag the slider of the second mode by the mouse, and return ms from each event to its picture."""
     box = page.get_by_test_id("mode-2").bounding_box()
@@ -67,14 +81,14 @@ def drag(page: Any, repeat: int) -> dict[str, Any]:
     page.mouse.move(box["x"] + box["width"] / 2, y)
     page.mouse.down()
     page.wait_for_timeout(500)
-    before = page.evaluate("window.shapespaceTimes.length = 0; window.shapespaceStage.a.frames")
+    before = page.evaluate("window.times.length = 0; window.shapespaceStage.a.frames")
     began = time.perf_counter()
     for step in range(repeat):
         page.mouse.move(box["x"] + box["width"] * (0.5 + 0.4 * np.sin(step / 8)), y)
     seconds = time.perf_counter() - began
     drawn = page.evaluate("window.shapespaceStage.a.frames") - before
     page.mouse.up()
-    return {"drag": page.evaluate("window.shapespaceTimes.slice()"), "pictures a second": drawn / seconds}
+    return {"drag": page.evaluate("window.times.slice()"), "pictures a second": drawn / seconds}
 
 
 def model_file(folder: Path) -> Path:
@@ -114,6 +128,7 @@ def measure(repeat: int) -> dict[str, object]:
                 page.wait_for_selector("[data-testid=pane][data-ready]")
                 opened = time.perf_counter() - start
                 page.wait_for_timeout(1500)
+                page.evaluate(TIMES)
                 asked: list[str] = []
                 page.on("request", lambda request: asked.append(request.url))
                 plain = page.evaluate(SCRIPT, [repeat, False]) | drag(page, repeat)

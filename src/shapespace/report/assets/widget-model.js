@@ -111,7 +111,7 @@
    * A slider from one shape to another. at(value): the coefficients at a value from -1 to 1, words(value): its name;
    * ends: texts of the buttons of both ends, label: of the slider.
    */
-  parts.morph = function (model, { stage, controls, at, words, ends, label, drawn = () => {} }) {
+  parts.morph = function (model, { stage, controls, at, words, ends, label }) {
     let now = -1, positions, change = null, isColoured = false;
     /** Draw the shape; isNew: from other ends. */
     const draw = (isNew) => {

@@ -18,17 +18,6 @@
     return z;
   }
 
-  window.shapespaceTimes = []; // ms from a slider's event to the picture, as drawn
-
-  function measureSliders(stage, controls) {
-    let began = 0;
-    controls.addEventListener("input", () => { began = began || performance.now(); }, true);
-    stage.a.on("draw", () => {
-      if (began) window.shapespaceTimes.push(performance.now() - began);
-      began = 0;
-    });
-  }
-
   /** The picture of a stage as PNG; two views are side by side. */
   async function picture({ views }) {
     const blobs = await Promise.all(views.map((view) => view.png()));
@@ -128,7 +117,6 @@
       const unsent = about.modes_sent < about.modes ? `, of which the first ${about.modes_sent} are shown; more would not fit here` : "";
       $("about").textContent = `${about.model}: ${about.vertices.toLocaleString("en")} vertices, ${about.modes} ${about.modes === 1 ? "mode" : "modes"}${unsent}`;
       modelTab = modes(unpacked, { stage, controls: $("model-controls"), model, z, onchange: page.onplace });
-      measureSliders(stage, $("model-controls"));
       const shape = { name: "shape", get z() { return Array.from(z); }, get b() { return Array.from(z, (value, k) => value * about.stddev[k]); } };
       $("export-shape").append(...exportButtons("export", (kind) => download({ z: shape.z }, kind, "shape"), shape));
       compareTab.start();
