@@ -128,6 +128,39 @@ def exclude_in_morphospace(tab, user: User, project: Path) -> None:
         tab.page.wait_for_timeout(100)
 
 
+def vertices_apart(tab, view: str, positions: str) -> np.ndarray:
+    """Return the direction in a picture from one vertex of the mean shape to another, of length 1."""
+    points = [f"{view}.project(Array.from({positions}.subarray({3 * k}, {3 * k + 3})))" for k in (0, 150)]
+    first, second = np.array(tab.page.evaluate(f"[{', '.join(points)}]"))[:, :2]
+    return (second - first) / np.linalg.norm(second - first)
+
+
+def name_a_view(tab, user: User) -> np.ndarray:
+    """Turn the surfaces and name their view by the keyboard; return a direction in its picture."""
+    tab.page.get_by_test_id("view-0").locator("canvas").first.focus()
+    for key in ["ArrowUp"] * 5 + ["ArrowRight"] * 3:
+        tab.page.keyboard.press(key)
+    user.click("views-edit")
+    tab.page.get_by_test_id("view-roll").focus()
+    tab.page.keyboard.press("PageUp")
+    tab.page.get_by_test_id("view-name").fill("dorsal")
+    tab.page.keyboard.press("Enter")
+    user.sees("named-view-dorsal")
+    tab.shot("naming")
+    assert barriers(tab) == []
+    tab.page.get_by_test_id("view-rename-dorsal").fill("above")
+    tab.page.keyboard.press("Enter")
+    user.sees("named-view-above")
+    tab.page.keyboard.press("Escape")
+    named = vertices_apart(tab, "window.shapespaceCells[0].view", "window.shapespaceCells[0].positions")
+    tab.page.get_by_test_id("front").click()
+    front = vertices_apart(tab, "window.shapespaceCells[0].view", "window.shapespaceCells[0].positions")
+    user.click("named-view-above")
+    again = vertices_apart(tab, "window.shapespaceCells[0].view", "window.shapespaceCells[0].positions")
+    assert named @ again > 0.9999 > 0.99 > named @ front
+    return named
+
+
 def is_outdated_until_undone(tab, user: User) -> None:
     """Change a class of the table: the answer that used it is marked on its screen and in the list of results."""
     tab.page.get_by_test_id("tab-specimens").click()
@@ -210,12 +243,18 @@ def test_raw_scans_become_a_report_by_clicks_and_history_gives_the_same_numbers(
             same_as_kept("screen-correspondence.png", shot, width=1200)
         if count == 4:
             place_and_drag(tab, project)
+            clicks, named = user.clicks, name_a_view(tab, user)
+            user.clicks = clicks
         user.click("next")
         user.click("run-build")
         user.has_run(2)
         has_drawn(tab)
         tab.shot("model")
         assert barriers(tab) == []
+        if count == 4:  # the view that was named on the surfaces is one of the model
+            tab.page.get_by_test_id("named-view-above").click()
+            mean = "window.shapespaceStage.a._things.get('model').object.geometry.attributes.position.array"
+            assert vertices_apart(tab, "window.shapespaceStage.a", mean) @ named > 0.999
         user.click("next")
         user.click("question-compare")
         user.click("term-group")
@@ -246,6 +285,9 @@ def test_raw_scans_become_a_report_by_clicks_and_history_gives_the_same_numbers(
             seen = open_tab(place, WINDOW, "dark")
             User(seen).sees("row-bone_001")
             assert seen.page.get_by_test_id("choose-files").count() == 0
+            seen.page.get_by_test_id("tab-model").click()
+            assert seen.page.get_by_test_id("views").count() == seen.page.get_by_test_id("named-view-above").count()
+            assert seen.page.get_by_test_id("views-edit").count() == 0
             seen.page.get_by_test_id("tab-questions").click()
             seen.page.get_by_test_id("earlier-3").click()
             User(seen).sees("sentences")

@@ -47,6 +47,9 @@ def project(tmp_path: Path) -> Project:
     return made
 
 
+DORSAL: dict[str, Any] = {"name": "dorsal", "toward_viewer": [0.0, 0.6, 0.8], "up": [1.0, 0.0, 0.0]}
+
+
 def edit(project: Project, **request: object) -> None:
     project.edit(project.revision, change_of(request))
 
@@ -76,6 +79,8 @@ def test_undo_takes_every_edit_back_and_redo_applies_it_again(project: Project) 
         {"what": "set", "ids": ["carl"], "set": "new"},
         {"what": "rename", "id": "carl", "to": "carol"},
         {"what": "landmarks", "landmarks": {"tip": 3}},
+        {"what": "views", "on": "correspondence-1", "views": [DORSAL], "before": []},
+        {"what": "views", "on": "correspondence-1", "views": [{**DORSAL, "name": "lateral"}], "before": [DORSAL]},
         {"what": "remove", "ids": ["ben"]},
         {"what": "remove-column", "column": "sex"},
     ):
@@ -112,6 +117,11 @@ def test_an_edit_of_a_state_that_another_tab_changed_is_refused(project: Project
     ({"what": "unit", "ids": ["anna"], "unit": "mile"}, "no unit 'mile'"),
     ({"what": "cells"}, "cannot be read"),
     ({"what": "nonsense"}, "cannot be read"),
+    ({"what": "views", "on": "", "views": [{**DORSAL, "name": " "}], "before": []}, "cannot be called"),
+    ({"what": "views", "on": "", "views": [DORSAL, DORSAL], "before": []}, "that no other has"),
+    ({"what": "views", "on": "", "views": [{**DORSAL, "up": [0.0, 3.0, 4.0]}], "before": []}, "not parallel"),
+    ({"what": "views", "on": "", "views": [{**DORSAL, "up": [0.0, 1.0]}], "before": []}, "cannot be read"),
+    ({"what": "views", "on": "", "views": []}, "cannot be read"),
     ({"what": "include", "ids": 5}, "cannot be read"),
 ])  # fmt: skip
 def test_an_edit_that_cannot_be_is_refused_in_a_sentence(
@@ -301,6 +311,18 @@ def test_a_cell_that_another_tab_changed_while_it_was_typed_is_not_overwritten(w
         edit(weighed, what="cells", cells=[cell])
     edit(weighed, what="cells", cells=[{**cell, "before": "f"}])
     assert weighed.state.specimens[1].cells["sex"] == "m"
+
+
+def test_named_views_that_another_tab_changed_are_not_overwritten(project: Project) -> None:
+    views: dict[str, Any] = {"what": "views", "on": "", "views": [DORSAL], "before": []}
+    edit(project, **views)
+    edit(project, **{**views, "on": "correspondence-1"})
+    for before in ([], [{**DORSAL, "up": [-1.0, 0.0, 0.0]}]):
+        with pytest.raises(StaleError, match="changed the named views"):
+            edit(project, **{**views, "views": [], "before": before})
+    edit(project, **{**views, "views": [], "before": [DORSAL]})
+    stored = Project.open(project.folder).state.views
+    assert stored[""] == () and [view.name for view in stored["correspondence-1"]] == ["dorsal"]
 
 
 def test_scans_in_another_unit_or_mirrored_are_written_in_mm_for_the_commands(

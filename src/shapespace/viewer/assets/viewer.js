@@ -18,7 +18,7 @@
   }
 
   /**
-   * Show the model at the address `base`, and its fits, in `root`; return {dispose(), place()}.
+   * Show the model at the address `base`, and its fits, in `root`; return {dispose(), place(), oriented()}.
    * options: {place, onplace(), onready()}.
    */
   Viewer.openModel = function (root, base, options) {
@@ -136,6 +136,7 @@
         page.fitView.stop();
         page.stage.dispose();
       },
+      oriented: () => ({ view: page.stage.a, turn: null }),
       place: () => (page.stage ? { tab: page.shown, z: textOf(page.z), fit: page.shown === "fits" ? fitsTab.name() || "" : "", camera: Viewer.cameraOf(page.stage.a) } : wanted),
     };
   };

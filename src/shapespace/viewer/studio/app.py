@@ -189,6 +189,7 @@ class OpenProject:
             "notes": state.notes(), "counts": state.counts(),
             "undo": project.undo_text, "redo": project.redo_text, "landmarks": state.landmarks,
             "landmarks_on": state.landmarks_on, "point_names": list(state.point_names),
+            "views": to_builtins(state.views),
             "jobs": [self._job(job) for job in jobs],
         }  # fmt: skip
 

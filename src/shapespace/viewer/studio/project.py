@@ -22,6 +22,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from shapespace.batch.result_folder import names_for
+from shapespace.cohort.orientation import view_rotation
 from shapespace.cohort.table import (
     fold_name,
     is_number,
@@ -38,7 +39,7 @@ from shapespace.io.landmarks.landmark_io import read_surface_landmarks, surface_
 from shapespace.io.meshes.mesh_io import MESH_FILE_ENDINGS, mesh_files, stem_of
 from shapespace.io.tables.table_io import DECIMAL_COMMA, KEYS, MISSING, key_column, table_text
 from shapespace.io.volume_io import VOLUME_ENDINGS
-from shapespace.schemas import json_text, read
+from shapespace.schemas import NamedView, Orientation, json_text, read
 from shapespace.store.corresponding import LANDMARKS
 from shapespace.types import MM_PER_UNIT, SurfaceLandmarks
 
@@ -97,6 +98,8 @@ class State(Struct, frozen=True, kw_only=True):
         point_names: names of the landmarks on scans, in their order in files.
         landmarks: name -> vertex of the surfaces in correspondence.
         landmarks_on: folder of these surfaces in the project.
+        views: folder of surfaces -> named views in the frame of their mean shape; those of the key "" are in the frames
+            of the scans' files, which may differ.
     """
 
     FORMAT: ClassVar[str] = "shapespace-project"
@@ -109,6 +112,7 @@ class State(Struct, frozen=True, kw_only=True):
     point_names: tuple[str, ...] = ()
     landmarks: dict[str, int] = {}
     landmarks_on: str = ""
+    views: dict[str, tuple[NamedView, ...]] = {}
 
     @property
     def names(self) -> list[tuple[str, ...]]:
@@ -624,7 +628,7 @@ def change_of(request: Mapping[str, Any]) -> Callable[[State], tuple[str, State]
         "cells": _edit_cells, "block": _edit_block, "include": _include, "set": _set_role, "remove": _remove,
         "rename": _rename, "unit": _set_unit, "mirror": _mirror, "original": _use_original, "add-column": _add_column,
         "remove-column": _remove_column, "landmarks": _set_landmarks, "points": _edit_points,
-        "point-names": _set_point_names,
+        "point-names": _set_point_names, "views": _set_views,
     }  # fmt: skip
 
     def change(state: State) -> tuple[str, State]:
@@ -760,6 +764,24 @@ def _set_landmarks(state: State, request: Mapping[str, Any]) -> tuple[str, State
     if "" in landmarks or min(landmarks.values(), default=0) < 0:
         raise InputError("A landmark needs a name and a vertex.")
     return "change the landmarks", replace(state, landmarks=landmarks, landmarks_on=str(request.get("on", "")))
+
+
+def _set_views(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
+    """Set the named views of the surfaces in a folder, or of scans."""
+    on = str(request["on"])
+    views, before = (
+        read(Orientation, {"views": request[key]}, "The named views", "reload the page").views
+        for key in ("views", "before")
+    )
+    if state.views.get(on, ()) != before:
+        raise StaleError("Another tab changed the named views in the meantime; look at them, and do it again.")
+    names = [view.name for view in views]
+    for view in views:
+        view_rotation(view)
+        if not view.name.strip() or len(view.name) > _LONGEST_NAME or names.count(view.name) > 1:
+            shown, most = view.name[:_LONGEST_NAME], f"{_LONGEST_NAME} characters"
+            raise InputError(f"A view cannot be called {shown!r}; give it a name of at most {most} that no other has.")
+    return "change the named views", replace(state, views={**state.views, on: views})
 
 
 def _edit_points(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
