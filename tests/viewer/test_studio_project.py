@@ -1,8 +1,9 @@
 """The project of the studio: what its edits do, what undo takes back, and what is refused."""
 
+import filecmp
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -161,6 +162,39 @@ def test_a_folder_is_imported_by_reference_or_as_copies(project: Project, tmp_pa
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="contains no meshes"):
         project.import_files(tmp_path / "empty", "training", copy=False)
+
+
+def test_thousands_of_scans_of_one_size_are_one_edit_and_take_a_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    project, scans, count = Project.open(tmp_path / "many", create=True), make_folder(tmp_path / "scans"), 2000
+    for k in range(count):
+        (scans / f"s{k:05}.obj").write_text(f"v 0 0 0\nv {1 + 1e-4 * k:.4f} 0 0\nv 0 1 0\nf 1 2 3\n")
+    shutil.copyfile(scans / "s00007.obj", scans / "twin.obj")
+    calls = {"write": 0, "compare": 0}
+
+    def counted(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*given: Any, **options: Any) -> Any:
+            calls[name] += 1
+            return function(*given, **options)
+
+        return call
+
+    monkeypatch.setattr(Project, "_write", counted("write", Project._write))
+    monkeypatch.setattr("filecmp.cmp", counted("compare", filecmp.cmp))
+    added, notes = project.import_files(scans, "training", copy=False)
+    assert (added, len(notes)) == (count, 1) and "twin.obj is the same file as s00007" in notes[0]
+    assert calls == {"write": 1, "compare": 1}
+    table = "".join(f"s{k:05},{'fm'[k % 2]},{k}\n" for k in range(10_000))
+    columns, cells, notes = cells_of_table(f"specimen,sex,age\n{table}".encode(), project.state)
+    assert columns == ["sex", "age"] and len(cells) == count and "8000 of 10000 rows" in notes[0]
+    project.edit(None, with_cells(columns, cells))
+    edit(project, what="cells", cells=[{"id": "s01999", "column": "age", "value": "7", "before": "1999"}])
+    assert Project.open(project.folder).state.specimens[-1].cells == {"sex": "m", "age": "7"}
+    project.undo(project.revision)
+    project.undo(project.revision)
+    project.undo(project.revision)
+    assert project.state.specimens == ()
 
 
 def test_a_table_is_joined_by_id_or_file_name_and_may_be_pasted(project: Project) -> None:
