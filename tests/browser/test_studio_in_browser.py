@@ -17,6 +17,7 @@ from pictures import change, drawn_share, same_as_kept
 
 from shapespace.cli import main
 from shapespace.model.shape_model import ShapeModel
+from shapespace.viewer.studio.project import Project, with_cells
 
 WINDOW = {"width": 1440, "height": 900}
 MOST_CLICKS = 15
@@ -368,6 +369,37 @@ def test_what_was_dropped_edited_and_excluded_is_there_after_a_restart(open_tab,
     with studio(project, tmp_path) as address:
         tab = open_tab(address, WINDOW)
         tab.until("document.querySelectorAll('[data-testid^=row-]').length === 4")
+
+
+COMPOSE = """(input, key) => input.dispatchEvent(new KeyboardEvent("keydown", { key, isComposing: true, bubbles: true, cancelable: true }))"""
+
+
+@pytest.mark.parametrize("locale", ["de-DE", pytest.param("ja-JP", marks=pytest.mark.pairs)])
+def test_numbers_and_words_of_other_languages_are_typed_as_there(open_tab, tmp_path: Path, locale: str) -> None:
+    project = Project.open(tmp_path / "p", create=True)
+    for k in range(1, 4):
+        path = project.new_file(f"s{k}.obj")
+        path.write_text(f"v 0 0 0\nv {1500 * k} 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+        project.add(path, "training")
+    project.edit(None, with_cells(("masse", "骨"), {}))
+    with studio(project.folder, tmp_path) as address:
+        tab = open_tab(address, WINDOW, locale=locale)
+        User(tab).sees("cell-s1-masse")
+        assert tab.page.evaluate("(1.5).toLocaleString()") == ("1,5" if locale == "de-DE" else "1.5")
+        cell = tab.page.get_by_test_id("cell-s1-masse")
+        cell.fill("3,5")
+        cell.press("Enter")
+        word = tab.page.get_by_test_id("cell-s1-骨")
+        word.fill("大腿骨")
+        for key in ("Enter", "ArrowDown"):
+            word.evaluate(COMPOSE, key)
+            assert word.evaluate("(input) => input === document.activeElement")
+        word.press("Enter")
+        tab.until("document.querySelector('[data-testid=cell-s1-骨]').dataset.edited === 'false'")
+        tab.until("document.querySelector('[data-testid=row-s2]')?.innerText.includes('3,000')")  # numbers as in the texts
+        tab.page.wait_for_timeout(500)
+        assert tab.complaints == []
+    assert Project.open(project.folder).state.specimens[0].cells == {"masse": "3.5", "骨": "大腿骨"}
 
 
 @pytest.mark.parametrize("count", [60, pytest.param(1000, marks=pytest.mark.long)])

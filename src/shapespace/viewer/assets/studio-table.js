@@ -51,6 +51,7 @@
       if (current.current === text) set(null);
     };
     const key = (event) => {
+      if (event.isComposing) return; // Enter and arrow keys are those of an input method
       const input = event.target, caret = input.selectionStart === input.selectionEnd ? input.selectionStart : -1;
       const all = input.selectionEnd - input.selectionStart === input.value.length;
       if (event.key === "Escape") { set(null); return; }
