@@ -104,25 +104,31 @@ def find_odd_scans(measures: Sequence[ScanMeasures], units: Sequence[str]) -> di
     mm = np.array([MM_PER_UNIT[unit] for unit in units])
     relative, ratios = unit_ratios((mm * [measure.size for measure in measures]).tolist())
     sizes, shape_ratios = np.log(relative * ratios), _shape_ratios(np.stack([measure.profile for measure in measures]))
+    usual = np.flatnonzero(ratios == 1.0)
+    if not len(usual):
+        return {}
+    lows, highs, middles = (np.full(len(sizes), of(sizes[usual])) for of in (np.min, np.max, np.median))
+    if len(usual) > 1:
+        order = usual[sizes[usual].argsort()]
+        lows[order[0]], highs[order[-1]] = sizes[order[1]], sizes[order[-2]]
+        middles[usual] = _medians_of_others(sizes[usual, None])[:, 0]
+    gaps, widths = np.maximum(lows - sizes, sizes - highs), highs - lows
+    odd_sizes = (gaps > widths) & (np.abs(sizes - middles) > np.log(OTHER_SIZE))
     found: dict[int, OddScan] = {}
-    for k, shape_ratio in enumerate(shape_ratios.tolist()):
-        others = sizes[(ratios == 1.0) & (np.arange(len(sizes)) != k)]
-        if not len(others):
-            continue
-        low, high, middle = float(others.min()), float(others.max()), float(np.median(others))
-        gap, width = max(low - sizes[k], sizes[k] - high), high - low
-        is_odd = gap > width and abs(sizes[k] - middle) > np.log(OTHER_SIZE)
-        margin = width * max(0.5, _UNSEEN / len(others))
+    for k in np.flatnonzero(odd_sizes | (shape_ratios != 1.0)).tolist():
+        low, high, gap, width, shape_ratio = (
+            float(values[k]) for values in (lows, highs, gaps, widths, shape_ratios)
+        )
+        margin = width * max(0.5, _UNSEEN / max(len(usual) - (ratios[k] == 1.0), 1))
         changes = {unit: float(np.log(length / mm[k])) for unit, length in MM_PER_UNIT.items()}
         fitting = [
             unit
             for unit, change in changes.items()
             if low - margin <= sizes[k] + change <= high + margin and abs(change) > np.log(LEAST_RATIO)
         ]
-        if is_odd or shape_ratio != 1.0:
-            is_clear = gap > width + 2.0 * margin and shape_ratio == 1.0 and len(fitting) == 1
-            unit = fitting[0] if is_odd and is_clear else ""
-            found[k] = OddScan(float(np.exp(sizes[k] - middle)) if is_odd else 1.0, unit, shape_ratio)
+        is_clear = gap > width + 2.0 * margin and shape_ratio == 1.0 and len(fitting) == 1
+        unit = fitting[0] if odd_sizes[k] and is_clear else ""
+        found[k] = OddScan(float(np.exp(sizes[k] - middles[k])) if odd_sizes[k] else 1.0, unit, shape_ratio)
     return found
 
 

@@ -225,6 +225,7 @@
       <div class="row bar result-bar">
         ${finished.length > 1 ? html`<label>${J.result} <select data-testid="result" value=${job.number} onchange=${(event) => choose(Number(event.target.value))}>
           ${finished.map((one) => html`<option key=${one.number} value=${one.number} selected=${one === job}>${kindOf(one)}, ${titleOf(one)}</option>`)}</select></label>` : html`<strong>${kindOf(job)}</strong>`}
+        <${Studio.Views} on=${Studio.frameOf(job)} shown=${Studio.pane?.result === job.number ? Studio.pane.oriented?.() : null} />
         <span class="grow"></span>
         ${reportOf(job) && html`<a href=${reportOf(job).href} target="_blank" rel="noopener" data-testid="open-result">${J.full}</a>`}
         <${Outdated} job=${job} />

@@ -110,7 +110,11 @@
           ...latest.current, place: isMine ? place : {}, onplace: later,
           onvertex: (vertex) => latest.current.onvertex?.(vertex), onlandmark: (...moved) => latest.current.onlandmark?.(...moved),
           onselected: (names) => latest.current.onselected?.(names),
-          onready: () => { element.dataset.ready = "true"; },
+          onready: () => {
+            element.dataset.ready = "true";
+            Studio.pane = { result, oriented: shown.current?.oriented };
+            Studio.changed();
+          },
         });
         if (ended) { opened.dispose(); return; }
         shown.current = opened;
@@ -119,6 +123,7 @@
       return () => {
         ended = true;
         clearTimeout(timer);
+        Studio.pane = null;
         if (shown.current) shown.current.dispose();
         shown.current = null;
       };

@@ -43,21 +43,26 @@
     if (sent.get(key) === point) sent.delete(key);
   }
 
-  /** The coordinates of a landmark, which are typed, or moved by the arrow keys until they are released. */
-  function Coordinates({ specimen, name, onmove }) {
-    const point = sent.get(`${specimen.id}/${name}`) || specimen.points[name];
+  /**
+   * The coordinates of a point in the frame of the file, which are typed, or moved by the arrow keys until they are released.
+   * onmove(numbers or null): while they change; onsend(numbers): when they are complete; size: extent of the scan.
+   */
+  Studio.Coordinates = function Coordinates({ testid, label, axisLabel, point, size, onsend, onmove }) {
     const [draft, setDraft] = useState(null);
     const typing = useRef(false); // whether the draft is unsent: the answer to an earlier edit must not discard it
-    useEffect(() => { typing.current = false; setDraft(null); }, [name]);
     useEffect(() => { if (!typing.current) setDraft(null); }, [String(point)]);
-    const change = (values) => { typing.current = true; setDraft(values); };
-    const values = draft || point || ["", "", ""];
-    const numbers = values.map((value) => (String(value).trim() ? Number(String(value).replace(",", ".")) : NaN));
+    const numbersOf = (texts) => texts.map((text) => (String(text).trim() ? Number(String(text).replace(",", ".")) : NaN));
+    const change = (texts) => {
+      typing.current = true;
+      setDraft(texts);
+      onmove(numbersOf(texts).every(Number.isFinite) ? numbersOf(texts) : null);
+    };
+    const values = draft || point || ["", "", ""], numbers = numbersOf(values);
     const send = async () => {
       typing.current = false;
       if (!draft || !numbers.every(Number.isFinite) || String(numbers) === String(point)) return;
       setDraft(null);
-      await place(specimen, name, numbers);
+      await onsend(numbers);
       onmove(null);
     };
     const key = (event, axis) => {
@@ -65,15 +70,13 @@
       if (event.key === "Enter") send();
       if (!step || !numbers.every(Number.isFinite)) return;
       event.preventDefault();
-      const next = numbers.map((value, k) => (k === axis ? Number((value + (step * specimen.extent) / STEPS).toPrecision(12)) : value));
-      change(next);
-      onmove([name, next]);
+      change(numbers.map((value, k) => (k === axis ? Number((value + (step * size) / STEPS).toPrecision(12)) : value)));
     };
-    return html`<fieldset class="choices coordinates" data-testid="coordinates"><legend>${M.coordinates(name)}</legend>
-      ${AXES.map((axis, k) => html`<label>${axis} <input inputmode="decimal" size="9" data-testid=${`mark-${axis}`} aria-label=${M.axis(axis, name)} value=${values[k]} onkeydown=${(event) => key(event, k)}
+    return html`<fieldset class="choices coordinates" data-testid="coordinates"><legend>${label}</legend>
+      ${AXES.map((axis, k) => html`<label>${axis} <input inputmode="decimal" size="9" data-testid=${`${testid}-${axis}`} aria-label=${axisLabel(axis)} value=${values[k]} onkeydown=${(event) => key(event, k)}
         onkeyup=${(event) => { if (event.key.startsWith("Arrow")) send(); }} oninput=${(event) => change(values.map((value, other) => (other === k ? event.target.value : value)))} onblur=${send} /></label>`)}
       <small class="hint">${M.file}</small></fieldset>`;
-  }
+  };
 
   const setNames = (names) => Studio.edit({ what: "point-names", names });
 
@@ -88,8 +91,8 @@
       <button class="small" data-testid="mark-add" disabled=${!name.trim()}>${M.add}</button></form>`;
   }
 
-  /** Landmarks of a scan: those of the project by name, in the view and as coordinates. `mirrored`: as the view shows it. */
-  function Landmarks({ specimen, view, box, mirrored }) {
+  /** Landmarks of a scan: those of the project by name, in the view and as coordinates. `mirrored`: as the view shows it; `cropping`: ref, whether clicks place a crop. */
+  function Landmarks({ specimen, view, box, mirrored, cropping }) {
     const { point_names: names, undo } = Studio.state.project, { points } = specimen;
     const [wanted, setChosen] = useState(null);
     const [moving, setMoving] = useState(null); // [name, point] while it is dragged
@@ -113,7 +116,7 @@
       const of = (hit) => now.current.flipped(hit.point.map((value) => Number(value.toPrecision(9)))); // the digits of float32
       view.on("click", (event) => {
         const { specimen: one, chosen: name, missing: left } = now.current, hit = under(event);
-        if (!hit || !name) return;
+        if (!hit || !name || cropping.current) return;
         if (left.includes(name)) setChosen(left[left.indexOf(name) + 1] || left.find((other) => other !== name) || name);
         place(one, name, of(hit));
       });
@@ -155,7 +158,8 @@
         <div ref=${list} class="mark-names" role="group" aria-label=${M.title}>${names.map((name) => html`<button type="button" key=${name} class=${points[name] ? "placed" : "missing"} aria-pressed=${name === chosen} data-testid=${`mark-${name}`}
           onclick=${() => setChosen(name)}>${name} <small>${points[name] ? M.isPlaced : M.missing}</small></button>`)}</div>
         ${!Studio.state.read_only && html`
-          ${chosen && html`<${Coordinates} specimen=${specimen} name=${chosen} onmove=${setMoving} />
+          ${chosen && html`<${Studio.Coordinates} key=${chosen} testid="mark" label=${M.coordinates(chosen)} axisLabel=${(axis) => M.axis(axis, chosen)} point=${sent.get(`${specimen.id}/${chosen}`) || points[chosen]} size=${specimen.extent}
+              onsend=${(point) => place(specimen, chosen, point)} onmove=${(point) => setMoving(point && [chosen, point])} />
             <div class="row"><${Button} small testid="mark-remove" disabled=${!points[chosen]} aria-label=${M.removeOf(chosen)} onclick=${() => place(specimen, chosen, null)}>${M.remove}<//>
               <${Button} small testid="mark-undo" disabled=${!undo} title=${undo ? S.undoOf(undo) : S.undo} onclick=${Studio.undo}>${S.undo}<//></div>`}
           <${AddName} onadd=${setChosen} />`}
@@ -189,6 +193,7 @@
   Studio.Scan = function Scan({ specimen, onclose }) {
     const box = useRef(null), bar = useRef(null), view = useRef(null);
     const mirrored = useRef(specimen.mirrored).current; // as the surface that is read
+    const cropping = useRef(false);
     const [state, setState] = useState(S.scan.reading);
     const [borders, setBorders] = useState(0);
     useEffect(() => {
@@ -217,9 +222,10 @@
       <${Dialog} title=${specimen.id} testid="scan" onclose=${onclose} wide>
         <div class="row" role="group" aria-label=${S.scan.sides}>${Object.keys(SIDES).map((side) => html`<${Button} small testid=${`scan-${side}`} onclick=${() => turn(side)}>${S.scan[side]}<//>`)}
           <span class="grow"></span><${Button} small testid="scan-close" onclick=${onclose}>${window.ShapespaceTexts.close}<//></div>
+        <${Studio.Views} on="" shown=${state === "" ? { view: view.current, turn: null } : null} />
         <div class="scan-body"><div class="scan-view"><div ref=${box} class="canvas" data-testid="scan-view" data-ready=${state === ""}></div><p class="hint" role="status">${state}</p><span ref=${bar} class="scale-bar" data-testid="scan-scale"></span></div>
-          ${state === "" && html`<${Landmarks} specimen=${specimen} view=${view.current} box=${box.current} mirrored=${mirrored} />`}</div>
-        <${Studio.Groom} specimen=${specimen} view=${view} ready=${state === ""} />
+          ${state === "" && html`<${Landmarks} specimen=${specimen} view=${view.current} box=${box.current} mirrored=${mirrored} cropping=${cropping} />`}</div>
+        <${Studio.Groom} specimen=${specimen} view=${view} ready=${state === ""} cropping=${cropping} />
         <p class="hint">${S.scan.axes}${borders ? ` ${S.scan.borders}` : ""}</p>
         <${Studio.Findings} specimen=${specimen} />
       <//>`;

@@ -14,6 +14,7 @@
     forms: {}, // of /api/forms
     volumes: [], // uploaded label volumes whose labels are not chosen yet: {file, name, set}
     uploads: null, // of the last drop
+    pane: null, // the result that is drawn: {result, oriented()}, see Viewer.openSurfaces
     changed: () => {}, // draws the page
   });
 
@@ -72,7 +73,7 @@
       const old = known.get(specimen.id);
       return old && JSON.stringify(old) === JSON.stringify(specimen) ? old : specimen;
     });
-    for (const key of ["columns", "point_names"]) if (JSON.stringify(before[key]) === JSON.stringify(state.project[key])) state.project[key] = before[key];
+    for (const key of ["columns", "point_names", "views"]) if (JSON.stringify(before[key]) === JSON.stringify(state.project[key])) state.project[key] = before[key];
   }
 
   // Scans may have been replaced in another program, which sends no event.

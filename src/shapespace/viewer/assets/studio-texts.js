@@ -66,7 +66,8 @@
         open: "Groom", done: "groomed", title: "Groom", largest: "Keep the largest piece", outer: "Remove inner surfaces", holes: "Fill holes with border edges up to",
         hint: "The part that remains keeps its coordinates and its unit. The file of the scan stays as it is.", apply: "Groom", original: "Use the original scan", running: "Being groomed",
         sphere: "Crop by a sphere", plane: "Crop by a plane", radius: "Radius", keep: "Keep", sides: { inside: "the part inside", outside: "the part outside", behind: "the part behind it", front: "the part in front of it" },
-        click: { sphere: "Click the centre of the sphere on the scan.", plane: "Turn the scan, then click a point on it: the plane passes through this point and faces you." },
+        click: { sphere: "Click the centre of the sphere on the scan, or type its coordinates.", plane: "Turn the scan, then click a point on it, or type its coordinates: the plane passes through this point and faces you." },
+        point: { sphere: "Centre of the sphere", plane: "Point of the plane" }, axis: (axis, tool) => `${axis} of the ${tool === "sphere" ? "centre" : "point"}`, face: "Turn the plane to the front",
         keeps: (percent) => `${percent} % of the points that are drawn remain.`, clear: "No crop",
       },
       volumes: {
@@ -86,6 +87,11 @@
       notes: "Look at the table", classes: "Classes", noClass: "(empty)", more: (number) => `Show ${number} more`,
       found: (repairs, notes) => [repairs && count(repairs, "repair"), notes && count(notes, "note")].filter(Boolean).join(", "),
       fixed: "Repaired: ", refused: "Cannot be used: ", note: "", nothing: "No specimen matches the filter.",
+    },
+    views: {
+      title: "Named views", first: "Name this view", edit: "Edit views", name: "Name of this view", names: ["dorsal", "ventral", "lateral", "medial", "anterior", "posterior"], roll: "Rotate",
+      save: "Save", rename: (name) => `Name of the view ${name}`, remove: (name) => `Remove the view ${name}`, take: (output) => `Use the views of ${output}`,
+      hint: "Turn the object, then name its view. The views are offered on these surfaces and their models.", scans: "Turn the scan, then name its view. The views are offered on all scans, and are right where their files have the same axes.",
     },
     uploads: {
       progress: (done, total) => `Adding file ${Math.min(done + 1, total)} of ${total}`, finished: (added) => `${count(added, "file")} added.`,

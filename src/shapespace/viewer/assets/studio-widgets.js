@@ -93,7 +93,7 @@
         <div class="row path">
           <label for="folder-path">${T.folders.path}</label>
           <input id="folder-path" data-testid="folder-path" value=${typed} oninput=${(event) => setTyped(event.target.value)}
-            onkeydown=${(event) => { if (event.key === "Enter") go(typed); }} />
+            onkeydown=${(event) => { if (event.key === "Enter" && !event.isComposing) go(typed); }} />
           <${Button} testid="folder-go" onclick=${() => go(typed)}>${T.folders.go}<//>
         </div>
         ${error && html`<p class="problem" role="alert">${error}</p>`}

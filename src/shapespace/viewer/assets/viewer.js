@@ -29,7 +29,7 @@
   }
 
   /**
-   * Show the model at the address `base`, and its fits, in `root`; return {dispose(), place()}.
+   * Show the model at the address `base`, and its fits, in `root`; return {dispose(), place(), oriented()}.
    * options: {place, onplace(), onready()}.
    */
   Viewer.openModel = function (root, base, options) {
@@ -150,6 +150,7 @@
         stop();
         page.stage?.dispose();
       },
+      oriented: () => ({ view: page.stage.a, turn: null }),
       place: () => (page.stage ? { tab: page.shown, z: textOf(page.z), fit: page.shown === "fits" ? fitsTab.name() || "" : "", camera: Viewer.cameraOf(page.stage.a) } : wanted),
     };
   };

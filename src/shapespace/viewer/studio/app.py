@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import threading
+import time
 import zipfile
 from collections.abc import AsyncGenerator, Callable, Generator, Mapping
 from contextlib import ExitStack, aclosing, suppress
@@ -189,6 +190,7 @@ class OpenProject:
             "notes": state.notes(), "counts": state.counts(),
             "undo": project.undo_text, "redo": project.redo_text, "landmarks": state.landmarks,
             "landmarks_on": state.landmarks_on, "point_names": list(state.point_names),
+            "views": to_builtins(state.views),
             "jobs": [self._job(job) for job in jobs],
         }  # fmt: skip
 
@@ -251,7 +253,7 @@ class Studio:
         self._forms, self._labels = forms, OptionLabels(forms)
         self._upload_bytes = upload_bytes
         self._read_only = read_only
-        self._changes = 0
+        self._changes, self._state_s = 0, 0.0  # and the seconds that the last state took
         self._open: OpenProject | None = None
         self._lock = threading.RLock()
         if folder is not None:
@@ -334,7 +336,8 @@ class Studio:
     # The state
 
     def _state(self, request: Request) -> Response:
-        return json_response(
+        began = time.monotonic()
+        response = json_response(
             {
                 "version": __version__, "project": None if self._open is None else self._open.facts(),
                 "recent": recent_projects(), "formats": list(MESH_ENDINGS),
@@ -343,6 +346,8 @@ class Studio:
                 "units": list(MM_PER_UNIT), "read_only": self._read_only,
             }
         )  # fmt: skip
+        self._state_s = time.monotonic() - began
+        return response
 
     async def _events(self, request: Request) -> Response:
         async def stream() -> AsyncGenerator[str]:
@@ -351,7 +356,7 @@ class Studio:
                 if sent != self._changes:
                     sent = self._changes
                     yield f"data: {json.dumps({'revision': sent})}\n\n"
-                await asyncio.sleep(_EVENT_S)
+                await asyncio.sleep(max(_EVENT_S, 2.0 * self._state_s))  # so that most of the time is for other requests
 
         return StreamingResponse(stream(), media_type="text/event-stream")
 

@@ -7,21 +7,24 @@ import filecmp
 import hashlib
 import io
 import json
+import os
 import re
 import threading
 from collections import Counter
 from collections.abc import Callable, Collection, Generator, Iterable, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import lru_cache
 from itertools import count
 from math import isfinite
 from operator import mul
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeAlias, cast
 
-from msgspec import Struct
+from msgspec import Struct, to_builtins
 from msgspec.structs import replace
 
 from shapespace.batch.result_folder import names_for
+from shapespace.cohort.orientation import view_rotation
 from shapespace.cohort.table import (
     fold_name,
     is_number,
@@ -38,7 +41,7 @@ from shapespace.io.landmarks.landmark_io import read_surface_landmarks, surface_
 from shapespace.io.meshes.mesh_io import MESH_FILE_ENDINGS, mesh_files, stem_of
 from shapespace.io.tables.table_io import DECIMAL_COMMA, KEYS, MISSING, key_column, table_text
 from shapespace.io.volume_io import VOLUME_ENDINGS
-from shapespace.schemas import json_text, read
+from shapespace.schemas import NamedView, Orientation, read
 from shapespace.store.corresponding import LANDMARKS
 from shapespace.types import MM_PER_UNIT, SurfaceLandmarks
 
@@ -56,6 +59,7 @@ MOST_POINTS = 500
 _LONGEST_NAME = 60  # characters of the name of a landmark
 _MOST_UNDONE = 100  # edits that can be undone
 _MOST_TABLES = 32  # texts of tables that are kept: jobs read those of few sets of specimens
+_BEGINNING, _MOST_HASHES = 2**14, 2**15  # bytes of a file that are hashed, and hashes in memory
 _LONGEST_ID, _LONGEST_CELL = 100, 1000  # characters
 _NO_FILE_NAME = re.compile(r'[/\\:*?"<>|\x00-\x1f]')
 STALE = "Another tab changed the project; look at it and do it again."
@@ -97,6 +101,8 @@ class State(Struct, frozen=True, kw_only=True):
         point_names: names of the landmarks on scans, in their order in files.
         landmarks: name -> vertex of the surfaces in correspondence.
         landmarks_on: folder of these surfaces in the project.
+        views: folder of surfaces -> named views in the frame of their mean shape; those of the key "" are in the frames
+            of the scans' files, which may differ.
     """
 
     FORMAT: ClassVar[str] = "shapespace-project"
@@ -109,6 +115,7 @@ class State(Struct, frozen=True, kw_only=True):
     point_names: tuple[str, ...] = ()
     landmarks: dict[str, int] = {}
     landmarks_on: str = ""
+    views: dict[str, tuple[NamedView, ...]] = {}
 
     @property
     def names(self) -> list[tuple[str, ...]]:
@@ -270,7 +277,9 @@ class Project:
         self.revision += is_edit
 
     def _write(self) -> None:
-        write_text(self.folder / self.FILE, json_text(self.state))
+        # Each specimen on a line of its own; with indentation it would take four times as long.
+        text = json.dumps(to_builtins(self.state), allow_nan=False).replace('{"id": ', '\n{"id": ')
+        write_text(self.folder / self.FILE, text + "\n")
 
     # Scans
 
@@ -311,32 +320,44 @@ class Project:
         Raises:
             FileError: the scan cannot be read.
         """
+        [added] = self._add_all([(file, called or file.name)], role)
+        return added
+
+    def _add_all(self, files: Sequence[tuple[Path, str]], role: Role) -> list[tuple[str, str | None]]:
+        """Add scans, each with the name of its file for the user, by one edit; see `add`."""
         with self._lock:
-            try:
-                size = file.stat().st_size
-                scans = [
-                    (specimen, place)
-                    for specimen in self.state.specimens
-                    for place in (specimen.file, specimen.original)
-                    if place
-                ]
-                for existing, place in scans:
+            state, specimens = self.state, list[Specimen]()
+            taken = {specimen.id.casefold() for specimen in state.specimens}
+            known: dict[object, list[tuple[str, Path]]] = {}  # beginning of a file -> specimens with such a file
+            added: list[tuple[str, str | None]] = []
+            for specimen in state.specimens:
+                for place in filter(None, (specimen.file, specimen.original)):
                     other = self.folder / place
-                    if other.is_file() and other.stat().st_size == size and filecmp.cmp(file, other, shallow=False):
-                        return existing.id, existing.id
-            except OSError as error:
-                raise FileError(f"Cannot read {file}: {error.strerror or error}.") from error
-            taken = {existing.id.casefold() for existing in self.state.specimens}
-            name = _free_name(_stem(called or file.name), taken)
-            inside = file.is_relative_to(self.folder)
-            place = file.relative_to(self.folder).as_posix() if inside else str(file)
-            specimen = Specimen(id=name, file=place, role=role)
-            self.edit(
-                None,
-                lambda state: ("", replace(state, specimens=(*state.specimens, specimen))),
-                together="add specimens",
-            )
-            return name, None
+                    with suppress(OSError):  # a scan that was moved is no duplicate
+                        known.setdefault(_beginning_of(other), []).append((specimen.id, other))
+            for file, called in files:
+                try:
+                    alike = known.setdefault(_beginning_of(file), [])
+                    same = next((name for name, other in alike if filecmp.cmp(file, other, shallow=False)), None)
+                except OSError as error:
+                    raise FileError(f"Cannot read {file}: {error.strerror or error}.") from error
+                if same is not None:
+                    added.append((same, same))
+                    continue
+                name = _free_name(_stem(called), taken)
+                inside = file.is_relative_to(self.folder)
+                place = file.relative_to(self.folder).as_posix() if inside else str(file)
+                specimens.append(Specimen(id=name, file=place, role=role))
+                taken.add(name.casefold())
+                alike.append((name, file))
+                added.append((name, None))
+            if specimens:
+                self.edit(
+                    None,
+                    lambda state: ("", replace(state, specimens=(*state.specimens, *specimens))),
+                    together="add specimens",
+                )
+            return added
 
     def add_stored(self, file: Path, role: Role, called: str) -> tuple[str, str | None]:
         """Add a scan in the project's folder, as `add` does; its file is removed if the scan is not added."""
@@ -357,25 +378,27 @@ class Project:
         import shutil
 
         listed = mesh_files([place.resolve()])
-        notes, added = list(listed.left_out), 0
-        for file in listed.files:
-            target = file
-            if copy:
+        notes, added = list(listed.left_out), list[tuple[str, str | None]]()
+        if not copy:
+            added = self._add_all([(file, file.name) for file in listed.files], role)
+        else:
+            for file in listed.files:
                 target = self.new_file(file.name)
                 with self.removed_on_error(target), atomic_path(target) as path:
                     shutil.copyfile(file, path)
-            _, same = self.add_stored(target, role, file.name) if copy else self.add(target, role)
+                added.append(self.add_stored(target, role, file.name))
+        for file, (_, same) in zip(listed.files, added, strict=True):
             if same is not None:
                 notes.append(f"{file.name} is the same file as {same}; it was not added again.")
-            added += same is None
-        return added, notes
+        return sum(same is None for _, same in added), notes
 
     # Results that become scans
 
     def add_surfaces(self, folder: Path, role: Role) -> list[str]:
         """Add the surfaces of label volumes in a folder of the project; return sentences on those not added."""
-        added = [(file.stem, self.add(file, role)[1]) for file in sorted(folder.glob("*.ply"))]
-        return [f"{name} is the same surface as {same}; it was not added." for name, same in added if same is not None]
+        files = sorted(folder.glob("*.ply"))
+        added = zip(files, self._add_all([(file, file.name) for file in files], role), strict=True)
+        return [f"{file.stem} is the same surface as {same}; it was not added." for file, (_, same) in added if same]
 
     def take_groomed(self, groomed: Mapping[str, str]) -> None:
         """Use groomed scans; a specimen whose scan was changed since the start of the grooming keeps its scan.
@@ -624,7 +647,7 @@ def change_of(request: Mapping[str, Any]) -> Callable[[State], tuple[str, State]
         "cells": _edit_cells, "block": _edit_block, "include": _include, "set": _set_role, "remove": _remove,
         "rename": _rename, "unit": _set_unit, "mirror": _mirror, "original": _use_original, "add-column": _add_column,
         "remove-column": _remove_column, "landmarks": _set_landmarks, "points": _edit_points,
-        "point-names": _set_point_names,
+        "point-names": _set_point_names, "views": _set_views,
     }  # fmt: skip
 
     def change(state: State) -> tuple[str, State]:
@@ -762,6 +785,24 @@ def _set_landmarks(state: State, request: Mapping[str, Any]) -> tuple[str, State
     return "change the landmarks", replace(state, landmarks=landmarks, landmarks_on=str(request.get("on", "")))
 
 
+def _set_views(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
+    """Set the named views of the surfaces in a folder, or of scans."""
+    on = str(request["on"])
+    views, before = (
+        read(Orientation, {"views": request[key]}, "The named views", "reload the page").views
+        for key in ("views", "before")
+    )
+    if state.views.get(on, ()) != before:
+        raise StaleError("Another tab changed the named views in the meantime; look at them, and do it again.")
+    names = [view.name for view in views]
+    for view in views:
+        view_rotation(view)
+        if not view.name.strip() or len(view.name) > _LONGEST_NAME or names.count(view.name) > 1:
+            shown, most = view.name[:_LONGEST_NAME], f"{_LONGEST_NAME} characters"
+            raise InputError(f"A view cannot be called {shown!r}; give it a name of at most {most} that no other has.")
+    return "change the named views", replace(state, views={**state.views, on: views})
+
+
 def _edit_points(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
     """Place the landmarks of a specimen, or remove those without coordinates."""
     name, wanted = str(request["id"]), dict(request["points"])
@@ -895,13 +936,27 @@ def scan_key(scan: Path, folder: Path) -> str:
     Scans in the project's `folder`, which may be moved, are identified by their path in it, others by their complete
     path: those of an archive can have the same name, size and time in different folders.
     """
-    place = scan.relative_to(folder).as_posix() if scan.is_relative_to(folder) else str(scan)
+    place, inside = str(scan), f"{folder}{os.sep}"  # paths of pathlib would take most of the time of a state
+    if place.startswith(inside):
+        place = place.removeprefix(inside).replace(os.sep, "/")
     try:
         stat = scan.stat()
         text = f"{place}|{stat.st_size}|{stat.st_mtime_ns}"
     except OSError:
         text = f"{place}|missing"
     return hashlib.sha256(text.encode(errors="surrogateescape")).hexdigest()[:24]
+
+
+def _beginning_of(file: Path) -> tuple[int, bytes]:
+    """Return the size of a file and a hash of its beginning, which distinguish nearly all files."""
+    stat = file.stat()
+    return stat.st_size, _hash_of_beginning(str(file), stat.st_size, stat.st_mtime_ns)
+
+
+@lru_cache(maxsize=_MOST_HASHES)
+def _hash_of_beginning(path: str, size: int, modified_ns: int) -> bytes:
+    with Path(path).open("rb") as file:
+        return hashlib.sha256(file.read(_BEGINNING)).digest()
 
 
 def _ending(name: str) -> str:
