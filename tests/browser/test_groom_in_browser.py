@@ -141,7 +141,7 @@ def test_scans_are_groomed_by_clicks_and_the_originals_come_back(open_tab, tmp_p
         for steps in (0, 100):
             for _ in range(steps):
                 tab.page.get_by_test_id("crop-x").press("ArrowUp")
-            centre = np.array(crop.numbers[:3]) + [steps * size / 500, 0, 0]
+            centre = np.add(crop.numbers[:3], [steps * size / 500, 0, 0])
             share = (np.linalg.norm(after.vertices - centre, axis=1) <= 0.2 * size).mean()
             assert abs(int(tab.page.get_by_test_id("crop-share").inner_text().split()[0]) - 100 * share) < 1
         user.click("crop-plane")

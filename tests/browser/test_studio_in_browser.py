@@ -371,7 +371,9 @@ def test_what_was_dropped_edited_and_excluded_is_there_after_a_restart(open_tab,
         tab.until("document.querySelectorAll('[data-testid^=row-]').length === 4")
 
 
-COMPOSE = """(input, key) => input.dispatchEvent(new KeyboardEvent("keydown", { key, isComposing: true, bubbles: true, cancelable: true }))"""
+COMPOSE = """(input, key) => {
+  input.dispatchEvent(new KeyboardEvent("keydown", { key, isComposing: true, bubbles: true, cancelable: true }));
+}"""
 
 
 @pytest.mark.parametrize("locale", ["de-DE", pytest.param("ja-JP", marks=pytest.mark.pairs)])
@@ -396,7 +398,9 @@ def test_numbers_and_words_of_other_languages_are_typed_as_there(open_tab, tmp_p
             assert word.evaluate("(input) => input === document.activeElement")
         word.press("Enter")
         tab.until("document.querySelector('[data-testid=cell-s1-骨]').dataset.edited === 'false'")
-        tab.until("document.querySelector('[data-testid=row-s2]')?.innerText.includes('3,000')")  # numbers as in the texts
+        tab.until(
+            "document.querySelector('[data-testid=row-s2]')?.innerText.includes('3,000')"
+        )  # numbers as in the texts
         tab.page.wait_for_timeout(500)
         assert tab.complaints == []
     assert Project.open(project.folder).state.specimens[0].cells == {"masse": "3.5", "骨": "大腿骨"}

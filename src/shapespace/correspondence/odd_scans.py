@@ -1,17 +1,18 @@
-"""Scans that differ from the others in size, unit or kind of object, found before a correspondence by cheap measures.
-
-The side of a scan is not found: only the comparison of registered surfaces shows it.
-"""
+"""Scans that differ from the others in size, unit, side or kind, found before a correspondence by cheap measures."""
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import permutations, product
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from shapespace.correspondence.correspondence_result import ENOUGH_TO_COMPARE, LEAST_RATIO, OTHER_SIZE, unit_ratios
-from shapespace.geometry.normals import face_areas, rms_size
+from shapespace.geometry.mirror_plane import ASYMMETRIC, FLIP
+from shapespace.geometry.normals import face_areas, face_vectors, faces_of, rms_size
 from shapespace.types import MM_PER_UNIT, FloatArray, Mesh
 
 _UNSEEN = 6.0
@@ -25,6 +26,17 @@ which it is farther than those of the usual shapes. Of 24 femora, molars, spleen
 2.6, and that of other objects at least 6.8, except between molars and spleens, whose profiles are alike. In collections
 of 4 to 24, one of another kind was found in 79 to 100 %, and 1 % of pure ones had a false finding; of simulated bones,
 organs and faces 5 %, 3 % and none."""
+
+_SAMPLED, _COARSE, _MATCHED = 500, 60, 100  # points of a sample, those that rank starts, and those that are matched
+_STARTS, _ITERATIONS = 2, 5  # poses that are refined, and steps of each
+_LEAST_SIDES = 10
+"""Number of scans from which their sides are judged: two anchors agree by chance on the sides of all with a probability
+of 0.4 %. In collections of 10 to 24 femora or hippocampi, all mirrored scans were named; a scan was named wrongly in at
+most 0.8 % of collections of molars, and in fewer of spleens and of simulated bones, organs and faces."""
+_AXES = np.array(
+    [np.diag(signs)[list(order)] for order in permutations(range(3)) for signs in product((1.0, -1.0), repeat=3)]
+)
+_TURNS = _AXES[np.linalg.det(_AXES) > 0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,9 +128,7 @@ def find_odd_scans(measures: Sequence[ScanMeasures], units: Sequence[str]) -> di
     odd_sizes = (gaps > widths) & (np.abs(sizes - middles) > np.log(OTHER_SIZE))
     found: dict[int, OddScan] = {}
     for k in np.flatnonzero(odd_sizes | (shape_ratios != 1.0)).tolist():
-        low, high, gap, width, shape_ratio = (
-            float(values[k]) for values in (lows, highs, gaps, widths, shape_ratios)
-        )
+        low, high, gap, width, shape_ratio = (float(values[k]) for values in (lows, highs, gaps, widths, shape_ratios))
         margin = width * max(0.5, _UNSEEN / max(len(usual) - (ratios[k] == 1.0), 1))
         changes = {unit: float(np.log(length / mm[k])) for unit, length in MM_PER_UNIT.items()}
         fitting = [
@@ -148,3 +158,85 @@ def _medians_of_others(values: FloatArray) -> FloatArray:
     middles = ((len(values) - 2) // 2, (len(values) - 1) // 2)
     low, high = (np.take_along_axis(ordered, middle + (rank <= middle), axis=0) for middle in middles)
     return 0.5 * (low + high)
+
+
+def side_sample(mesh: Mesh) -> FloatArray:
+    """Return points of a surface and their normals, (500, 6), centred and scaled to an RMS size of 1, for
+    `find_mirrored_scans`. They are random in each scan: on equal triangles they would be at the same places.
+    """
+    rng = np.random.default_rng(zlib.crc32(mesh.vertices.tobytes()))
+    vectors = face_vectors(mesh.vertices, faces_of(mesh))
+    areas = np.linalg.norm(vectors, axis=1)
+    chosen = rng.choice(len(areas), _SAMPLED, p=areas / areas.sum())
+    points = np.einsum("nk,nkd->nd", rng.dirichlet(np.ones(3), _SAMPLED), mesh.vertices[faces_of(mesh)[chosen]])
+    points = points - points.mean(axis=0)
+    return np.hstack([points / rms_size(points), vectors[chosen] / areas[chosen, None]])
+
+
+class _Side:
+    """A sample of a scan with its principal axes and nearest points."""
+
+    def __init__(self, sample: FloatArray) -> None:
+        self.points, self.normals = np.hsplit(np.asarray(sample, dtype=np.float64), 2)
+        self.near = KDTree(self.points)
+        self.axes = np.linalg.eigh(self.points.T @ self.points)[1]
+        self.axes[:, 2] *= np.linalg.det(self.axes)
+
+    def distance(self, other: _Side) -> float:
+        """Return the mean distance between two surfaces in their best pose: rigid ICP from some of the 24 poses that
+        align their principal axes."""
+        R = self.axes @ _TURNS @ other.axes.T
+        R = R[self.near.query(other.points[:_COARSE] @ R.transpose(0, 2, 1))[0].mean(axis=1).argsort()[:_STARTS]]
+        t, own, theirs = np.zeros((len(R), 3)), self.points[:_MATCHED], other.points[:_MATCHED]
+        for step in range(_ITERATIONS + 1):
+            there, back = theirs @ R.transpose(0, 2, 1) + t[:, None], (own - t[:, None]) @ R
+            (forward, i), (backward, k) = self.near.query(there), other.near.query(back)
+            if step == _ITERATIONS:
+                break
+            a = np.concatenate([self.points[i], np.broadcast_to(own, back.shape)], axis=1)
+            b = np.concatenate([np.broadcast_to(theirs, there.shape), other.points[k]], axis=1)
+            distances = np.concatenate([forward, backward], axis=1)
+            w = (1.0 + (distances / (2.0 * np.median(distances, axis=1, keepdims=True))) ** 2)[..., None] ** -2
+            mean_a, mean_b = ((w * x).sum(axis=1, keepdims=True) / w.sum(axis=1, keepdims=True) for x in (a, b))
+            u, _, vt = np.linalg.svd((w * (a - mean_a)).transpose(0, 2, 1) @ (b - mean_b))
+            u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
+            R = u @ vt
+            t = (mean_a - mean_b @ R.transpose(0, 2, 1))[:, 0]
+        to_planes = [
+            np.abs(((moved - side.points[near]) * side.normals[near]).sum(axis=-1)).mean(axis=1)
+            for moved, side, near in ((there, self, i), (back, other, k))
+        ]
+        return float(np.sum(to_planes, axis=0).min())
+
+
+def find_mirrored_scans(samples: Sequence[FloatArray]) -> list[int]:
+    """Return the scans that are mirror images of most, by their index; none if the scans do not show it clearly.
+
+    Each scan and its mirror image are compared with two scans. A scan is named only if both comparisons agree on the
+    sides of all scans, each by more than the differences of symmetric objects.
+
+    Args:
+        samples: sample of each scan, see `side_sample`.
+    """
+    count = len(samples)
+    if count < _LEAST_SIDES:
+        return []
+    sides, anchors = [_Side(sample) for sample in samples], (0, count // 2)
+    images = [_Side(sample * np.tile(FLIP, 2)) for sample in samples]
+    evidence = np.array(
+        [
+            [
+                np.inf
+                if side is sides[anchor]
+                else np.log(sides[anchor].distance(image) / sides[anchor].distance(side))
+                for side, image in zip(sides, images, strict=True)
+            ]
+            for anchor in anchors
+        ]
+    )
+    first, second = np.sign(evidence)
+    second = np.where(np.arange(count) == anchors[1], first, second * first[anchors[1]])
+    if np.abs(evidence).min() <= ASYMMETRIC or (first != second).any():
+        return []
+    is_mirrored = first < 0
+    return np.flatnonzero(~is_mirrored if 2 * is_mirrored.sum() > count else is_mirrored).tolist()

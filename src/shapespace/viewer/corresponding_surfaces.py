@@ -78,7 +78,7 @@ class Surfaces:
         }
 
     def packed_mean(self) -> bytes:
-        """Return the mean shape, upright, its checkerboard, the triangles that are drawn, and the rotation from the frame
+        """Return the mean shape, upright, its checkerboard, the triangles drawn, and its rotation from the frame
         of the folder."""
         with self._lock:
             if self._packed_mean is None:

@@ -102,9 +102,15 @@
     const [name, setName] = useState(null);
     const ref = useRef(null);
     useEffect(() => { if (ref.current) ref.current.focus(); }, [name === null]);
+    const add = async (event) => {
+      event.preventDefault();
+      if (!(await Studio.edit({ what: "add-column", column: name.trim() }))) return;
+      setName(null);
+      document.querySelector(`input[data-row="0"][data-column="${Studio.state.project.columns.length}"]`)?.focus(); // its first cell
+    };
     if (name === null) return html`<${Button} edits testid="add-column" onclick=${() => setName("")}>${S.addColumn}<//>`;
     return html`
-      <form class="row inline" onsubmit=${async (event) => { event.preventDefault(); if (await Studio.edit({ what: "add-column", column: name.trim() })) setName(null); }}>
+      <form class="row inline" onsubmit=${add}>
         <input ref=${ref} aria-label=${S.columnName} placeholder=${S.columnName} required data-testid="column-name" value=${name} oninput=${(event) => setName(event.target.value)}
           onkeydown=${(event) => { if (event.key === "Escape") setName(null); }} />
         <button class="small" data-testid="column-add">${S.add}</button>
