@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar, cast
 
 from shapespace.cli.options import given
 from shapespace.cli.printing import warn
@@ -32,7 +32,8 @@ class InputAccepted(Exception):  # noqa: N818 - no error
 
 
 def reason_of_rejection(words: Sequence[str], folders: Sequence[Path]) -> str:
-    """Return why the command of a question would reject its input; empty if it begins to compute.
+    """Return why the command of a question would reject its input; empty if it begins to compute. `align`, which
+    questions about landmarks read, computes its result.
 
     Args:
         words: arguments of the command.
@@ -50,9 +51,7 @@ def reason_of_rejection(words: Sequence[str], folders: Sequence[Path]) -> str:
         if not folders:
             return ""
         for name, value in vars(arguments).items():
-            if isinstance(value, Path):
-                there = (folder / value for folder in folders if (folder / value).exists())
-                setattr(arguments, name, next(there, folders[-1] / value))
+            setattr(arguments, name, _place(value, folders))
         arguments.only_check = True
         arguments.run(arguments)
     except ShapespaceError as error:
@@ -60,6 +59,15 @@ def reason_of_rejection(words: Sequence[str], folders: Sequence[Path]) -> str:
     except InputAccepted:
         pass
     return ""
+
+
+def _place(value: Any, folders: Sequence[Path]) -> Any:
+    """Return a path, or the paths of a list, in the first of the folders that has it; other values as they are."""
+    if isinstance(value, list):
+        return [_place(part, folders) for part in cast(list[Any], value)]
+    if isinstance(value, Path):
+        return next((folder / value for folder in folders if (folder / value).exists()), folders[-1] / value)
+    return value
 
 
 def _end_check(done: int, total: int) -> None:
@@ -186,6 +194,8 @@ def answer_align(arguments: argparse.Namespace) -> Outcome:
     config = AlignConfig(**given(arguments, AlignConfig))
     reflect = column_value(arguments.reflect, "--reflect") if arguments.reflect else None
     _, record = align(arguments.data, arguments.output, config, **given(arguments, align, reflect=reflect))
+    if hasattr(arguments, "only_check"):
+        raise InputAccepted
     check = len({finding.specimen for finding in record.findings})
     lines = [
         f"{record.specimens} specimens with {record.landmarks} landmarks ({record.dimensions}-D) are aligned.",
