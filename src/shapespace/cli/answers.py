@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any, NoReturn, TypeVar, cast
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from shapespace.cli.options import given
 from shapespace.cli.printing import warn
@@ -51,7 +51,9 @@ def reason_of_rejection(words: Sequence[str], folders: Sequence[Path]) -> str:
         if not folders:
             return ""
         for name, value in vars(arguments).items():
-            setattr(arguments, name, _place(value, folders))
+            if isinstance(value, Path):
+                there = (folder / value for folder in folders if (folder / value).exists())
+                setattr(arguments, name, next(there, folders[-1] / value))
         arguments.only_check = True
         arguments.run(arguments)
     except ShapespaceError as error:
@@ -59,15 +61,6 @@ def reason_of_rejection(words: Sequence[str], folders: Sequence[Path]) -> str:
     except InputAccepted:
         pass
     return ""
-
-
-def _place(value: Any, folders: Sequence[Path]) -> Any:
-    """Return a path, or the paths of a list, in the first of the folders that has it; other values as they are."""
-    if isinstance(value, list):
-        return [_place(part, folders) for part in cast(list[Any], value)]
-    if isinstance(value, Path):
-        return next((folder / value for folder in folders if (folder / value).exists()), folders[-1] / value)
-    return value
 
 
 def _end_check(done: int, total: int) -> None:

@@ -330,12 +330,8 @@ def pairs_by_name(names: Sequence[str]) -> tuple[tuple[str, str], ...]:
         names: names of landmarks, such as `left arch`, `arch_R` or `L3`.
     """
     folded = {name.casefold(): name for name in names}
-    pairs: dict[str, str] = {}
-    for name in folded:
-        other = _SIDE.sub(lambda side: _OTHER_SIDE[side[0]], name)
-        if other in folded and other != name and folded[other] not in pairs:
-            pairs[folded[name]] = folded[other]
-    return tuple(pairs.items())
+    others = {name: folded.get(_SIDE.sub(lambda side: _OTHER_SIDE[side[0]], key)) for key, name in folded.items()}
+    return tuple((a, b) for a, b in others.items() if b is not None and names.index(a) < names.index(b))
 
 
 def _paired_sides(vertices: IntArray, faces: IntArray | None, partner: IntArray, **known: Any) -> Sides:

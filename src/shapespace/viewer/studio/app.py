@@ -410,10 +410,9 @@ class Studio:
         if not name.lower().endswith(_VOLUME_ENDINGS):
             raise HTTPException(415, f"{name} is not a volume that can be read; drop {', '.join(_VOLUME_ENDINGS)}.")
         target = await self._store(request, name)
-        project = self._project.project
-        kept, is_same = await run_in_threadpool(project.keep_volume, target)
-        file = kept.relative_to(project.folder).as_posix()
-        return json_response({"file": file, "same_as": kept.name if is_same else None}, 201)
+        kept = await run_in_threadpool(self._project.project.keep_volume, target)
+        same_as = None if kept == target else kept.name
+        return json_response({"file": f"{kept.parent.name}/{kept.name}", "same_as": same_as}, 201)
 
     async def _labels_of_volume(self, request: Request) -> Response:
         content = await json_body(request, _REQUEST_BYTES)
@@ -477,11 +476,10 @@ class Studio:
 
     async def _take_landmarks(self, content: bytes, name: str) -> Response:
         project = self._project.project
-        taken = await run_in_threadpool(read_points, content, name, project.state)
-        edit = with_points(taken.names, taken.points, taken.curves)
-        await run_in_threadpool(project.edit, None, edit, together="import landmarks")
+        names, points, curves, notes = await run_in_threadpool(read_points, content, name, project.state)
+        await run_in_threadpool(project.edit, None, with_points(names, points, curves), together="import landmarks")
         self._changed()
-        return json_response({"matched": len(taken.points), "landmarks": len(taken.names), "notes": taken.notes})
+        return json_response({"matched": len(points), "landmarks": len(names), "notes": notes})
 
     async def _match_block(self, request: Request) -> Response:
         content = await json_body(request, _TABLE_BYTES)

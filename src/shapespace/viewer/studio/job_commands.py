@@ -10,7 +10,7 @@ import re
 import shutil
 import threading
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from functools import lru_cache
 from pathlib import Path
@@ -352,11 +352,9 @@ def _specimens_of(project: Project, shapes: Job | None, options: Mapping[str, An
 def _by_class(specimens: Sequence[Specimen], named: Any) -> tuple[Sequence[Specimen], Sequence[Specimen]]:
     """Return the specimens of the class `column=value`, and the others."""
     column, _, value = str(named or "").partition("=")
-    members: list[Specimen] = []
-    others: list[Specimen] = []
-    for specimen in specimens:
-        (members if value and specimen.cells.get(column) == value else others).append(specimen)
-    return members, others
+    members = [specimen for specimen in specimens if value and specimen.cells.get(column) == value]
+    ids = {specimen.id for specimen in members}
+    return members, [specimen for specimen in specimens if specimen.id not in ids]
 
 
 def result_of(jobs: Sequence[Job], kinds: Sequence[str], on: int | None) -> Job:
@@ -426,15 +424,11 @@ def checks(
             found.append({"level": "warning" if len(chosen) - len(lacking) >= 2 else "problem", "text": text})
     if shapes is not None and shapes.number == PLACED:
         placed = placed_landmarks(project, options)
-        every = len(project.state.point_names)
+        every, excluded = len(project.state.point_names), len(placed.lacking) - len(placed.points)
         lacking = [f"{name} {count} of {every}" for name, count in placed.lacking.items() if count]
-        if lacking:
-            excluded = len(placed.lacking) - len(placed.points)
-            result = f"excluded specimens: {excluded}" if excluded else f"landmarks in use: {len(placed.names)}"
-            text = (
-                f"Landmarks are missing ({list_names(lacking)}); {result}. Place them, or choose {MISSING_LANDMARKS}."
-            )
-            found.append({"level": "warning", "text": text})
+        result = f"excluded specimens: {excluded}" if excluded else f"landmarks in use: {len(placed.names)}"
+        text = f"Landmarks are missing ({list_names(lacking)}); {result}. Place them, or see {MISSING_LANDMARKS}."
+        found += [{"level": "warning", "text": text}] if lacking else []
     if kind == "score" and options.get("--reference"):
         members, others = map(len, _by_class(chosen, options["--reference"]))
         level = "problem" if members < 2 or not others else "warning" if members < 20 else "ok"
@@ -498,12 +492,14 @@ def _reason_of_rejection(
     in correspondence, which would take too long to read.
     """
     shapes = shapes or Job(number=1, kind="correspond", arguments=(), output="shapes")
-    if kind == "power" and re.fullmatch(r"corrected|[\d.]+x", str(options.get("--effect") or "corrected")):
+    is_of_shapes = re.fullmatch(r"corrected|[\d.]+x", str(options.get("--effect") or "corrected"))
+    if kind == "power" and is_of_shapes and shapes.number != PLACED:
         options = {**options, "--effect": "observed"}  # whether there is such an effect depends on the real surfaces
+    is_placed, is_fit = shapes.number == PLACED, shapes.kind == "fit"
     with ExitStack() as stack:
         try:
             made = _question(project, shapes, forms, kind, options, 0)
-            if shapes.number == PLACED or shapes.kind == "fit":
+            if is_placed or is_fit:
                 temporary = TemporaryDirectory(prefix="shapespace-check-", ignore_cleanup_errors=True)
                 folder = Path(stack.enter_context(temporary))
             else:
@@ -511,39 +507,27 @@ def _reason_of_rejection(
                 folder = _small_surfaces(project, shapes, names, max(_LEAST_WAYS, *ways, 0))
                 stack.enter_context(_checking)
             made.write_files(folder)
-            if shapes.number == PLACED:
-                return _try_placed(made, forms[kind]["check"], folder, project.folder)
-            if shapes.kind == "fit":
+            if is_fit:
                 (folder / shapes.output).symlink_to(project.folder / shapes.output)
         except InputError as error:
             return str(error), ()
         except OSError:
             return "", ()  # Windows does not allow links to all users
-        way = ["--set", "surfaces=coefficients"] if shapes.kind == "fit" else []
-        is_parsed_only = any(options.get(flag) for flag in _OF_SURFACES)
+        way = ["--set", "surfaces=coefficients"] if is_fit else []
+        is_parsed_only = not is_placed and any(options.get(flag) for flag in _OF_SURFACES)
         folders = [] if is_parsed_only else [folder, project.folder]
-        reason = str(forms[kind]["check"]([*made.arguments, *way], folders))
-        return _without_folders(reason, made, folder, project.folder), ()
-
-
-def _try_placed(
-    made: Order, check: Callable[[Sequence[str], Sequence[Path]], str], folder: Path, of_project: Path
-) -> tuple[str, Sequence[str]]:
-    """Return why the command of a question about landmarks on scans would reject them, and notes on their alignment."""
-    reason, notes = check(made.before[0], [folder]), tuple[str, ...]()
-    if not reason:
-        record = folder / made.before[0][3] / RECORD
-        notes = read(AlignRecord, read_json(record, ""), str(record), "").notes[:_MOST_ODD]
-        reason = check(made.arguments, [folder, of_project])
-    texts = [_without_folders(text, made, folder, of_project) for text in (reason, *notes)]
-    return texts[0], texts[1:]
-
-
-def _without_folders(text: str, made: Order, *folders: Path) -> str:
-    text = text.replace(str(folders[0] / next(iter(made.files))), "The table")
-    for folder in folders:
-        text = text.replace(f"{folder}{os.sep}", "")
-    return text
+        aligned = [[str(folder / word) if word in made.files else word for word in words] for words in made.before]
+        check, record = forms[kind]["check"], folder / _INPUTS / "0000-landmarks/aligned" / RECORD
+        reason = next(filter(None, (check(words, [folder]) for words in aligned)), "")
+        reason = reason or check([*made.arguments, *way], folders)
+        notes = read(AlignRecord, read_json(record, ""), str(record), "").notes if record.is_file() else ()
+        texts = [
+            text.replace(str(folder / next(iter(made.files))), "The table")
+            .replace(f"{folder}{os.sep}", "")
+            .replace(f"{project.folder}{os.sep}", "")
+            for text in (reason, *notes[:_MOST_ODD])
+        ]
+        return texts[0], texts[1:]
 
 
 def _small_surfaces(project: Project, shapes: Job, names: Sequence[str], ways: int) -> Path:
@@ -553,27 +537,28 @@ def _small_surfaces(project: Project, shapes: Job, names: Sequence[str], ways: i
     names = sorted(_surface_names(project, shapes)) if source.is_dir() else names
     path = source / CorrespondenceRecord.FILE
     record = path.read_bytes() if path.is_file() else b""
-    key = (shapes.output, tuple(names), ways, record)
-    return project.cached(key, lambda: _SmallSurfaces(shapes.output, names, ways, record)).folder
+    return project.cached(
+        (shapes.output, tuple(names), ways, record),
+        lambda: _write_small_surfaces(project, shapes.output, names, ways, record),
+    )
 
 
-class _SmallSurfaces:
-    """Small surfaces in a temporary folder, which is removed with this object."""
-
-    def __init__(self, output: str, names: Sequence[str], ways: int, record: bytes) -> None:
-        self.folder = Path(mkdtemp(prefix="shapespace-check-"))
-        weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
-        rng = np.random.default_rng(0)
-        half = rng.normal([4.0, 0.0, 0.0], size=(min(ways, len(names)) // 6 + 6, 3))
-        template = np.concatenate([half, half * (-1.0, 1.0, 1.0)])
-        triangles = np.arange(len(half) - 2)[:, None] + np.arange(3)
-        faces = np.concatenate([triangles, triangles[:, ::-1] + len(half)]).astype(np.int32)
-        target = make_folder(self.folder / output)
-        for name in names:
-            vertices = template + 0.1 * rng.normal(size=template.shape)
-            write_mesh(target / f"{name}{CorrespondRecord.SURFACE}", Mesh(vertices, faces))
-        if record:
-            write_bytes(target / CorrespondenceRecord.FILE, record)
+def _write_small_surfaces(project: Project, output: str, names: Sequence[str], ways: int, record: bytes) -> Path:
+    """Return a new folder with small surfaces, which is removed with the project's object."""
+    folder = Path(mkdtemp(prefix="shapespace-check-"))
+    weakref.finalize(project, shutil.rmtree, folder, ignore_errors=True)
+    rng = np.random.default_rng(0)
+    half = rng.normal([4.0, 0.0, 0.0], size=(min(ways, len(names)) // 6 + 6, 3))
+    template = np.concatenate([half, half * (-1.0, 1.0, 1.0)])
+    triangles = np.arange(len(half) - 2)[:, None] + np.arange(3)
+    faces = np.concatenate([triangles, triangles[:, ::-1] + len(half)]).astype(np.int32)
+    target = make_folder(folder / output)
+    for name in names:
+        vertices = template + 0.1 * rng.normal(size=template.shape)
+        write_mesh(target / f"{name}{CorrespondRecord.SURFACE}", Mesh(vertices, faces))
+    if record:
+        write_bytes(target / CorrespondenceRecord.FILE, record)
+    return folder
 
 
 Outdated = Literal["specimens", "table", "landmarks", "redone", "source"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -20,9 +20,9 @@ from shapespace.io.landmarks.landmark_configurations import (
     MOST_CURVE_POINTS,
     NO_SLIDERS,
     LandmarkConfigurations,
+    consecutive_curves,
     resample_polyline,
 )
-from shapespace.io.landmarks.landmark_configurations import Curve as IntCurve
 from shapespace.io.tables.table_io import table_rows
 from shapespace.types import MM_PER_UNIT
 from shapespace.viewer.studio.project import Curve, Point, State, point_of
@@ -58,25 +58,11 @@ def is_landmark_table(content: bytes, name: str, state: State) -> bool:
     return has_rows and not has_specimens and _is_known(Path(name).stem, state)
 
 
-@dataclass(frozen=True)
-class ImportedLandmarks:
-    """Landmarks of a file.
-
-    Args:
-        names: names of the landmarks, with those of the points of curves.
-        points: id -> name -> landmark.
-        curves: name -> curve whose points are among them.
-        notes: sentences on changed or omitted data, and on specimens of the file that the project does not have.
-    """
-
-    names: tuple[str, ...]
-    points: dict[str, dict[str, Point]]
-    curves: dict[str, Curve]
-    notes: tuple[str, ...]
-
-
-def read_points(content: bytes, name: str, state: State) -> ImportedLandmarks:
-    """Return the landmarks in a file.
+def read_points(
+    content: bytes, name: str, state: State
+) -> tuple[tuple[str, ...], dict[str, dict[str, Point]], dict[str, Curve], list[str]]:
+    """Return the names of the landmarks in a file, with those of points of curves, the landmarks of each specimen, the
+    curves, and sentences on changed or omitted data and on specimens of the file that the project does not have.
 
     Coordinates are in the frame and unit of the scan's file; those of Slicer are in LPS, as its meshes, and other units
     than mm are converted to that of the specimen. Missing landmarks are omitted. Curves get the number of points of the
@@ -114,41 +100,35 @@ def read_points(content: bytes, name: str, state: State) -> ImportedLandmarks:
         points[specimen.id] = {raw.landmarks[k]: point_of(own[k]) for k in range(len(own)) if observed[row, k]}
     names = tuple(name for k, name in enumerate(raw.landmarks) if observed[:, k].any())
     notes = [note.replace(raw.where, name) for note in raw.notes if "match_curves" not in note]  # no option here
-    return ImportedLandmarks(names, points, curves, (*notes, *([] if is_single else unmatched)))
+    return names, points, curves, [*notes, *([] if is_single else unmatched)]
 
 
 def _with_named_curves(raw: LandmarkConfigurations, state: State) -> tuple[LandmarkConfigurations, dict[str, Curve]]:
     """Return landmarks after whose last one the points of each curve follow, called after it, and the curves."""
     on_curves = {point for points, _ in raw.curves for point in points}
     fixed = [k for k in range(len(raw.landmarks)) if k not in on_curves]
-    parts, names, spans = [raw.points[:, fixed]], [raw.landmarks[k] for k in fixed], list[IntCurve]()
-    curves: dict[str, Curve] = {}
+    parts, curves = [raw.points[:, fixed]], dict[str, Curve]()
     for number, (points, closed) in enumerate(raw.curves, 1):
         called = _NUMBERED.sub("", raw.landmarks[points[0]]).strip()
         called = f"curve {number}" if called in curves or _DEFAULT_NAME.fullmatch(called) else called
-        curve = state.curves.get(called, Curve(min(len(points), MOST_CURVE_POINTS), closed))
+        curve = curves[called] = state.curves.get(called, Curve(min(len(points), MOST_CURVE_POINTS), closed))
         own = raw.points[:, points]
-        if len(points) != curve.points:
-            own = np.array([resample_polyline(path, curve.points, closed) for path in own])
-        spans.append((tuple(range(len(names), len(names) + curve.points)), closed))
-        parts.append(own)
-        names += curve.names(called)
-        curves[called] = curve
-    named = replace(
-        raw, points=np.concatenate(parts, axis=1), landmarks=tuple(names), curves=tuple(spans), curve_sliders=NO_SLIDERS
-    )
+        is_equal = len(points) == curve.points
+        parts.append(own if is_equal else np.array([resample_polyline(x, curve.points, closed) for x in own]))
+    on_curve = [point for called, curve in curves.items() for point in curve.names(called)]
+    names = (*(raw.landmarks[k] for k in fixed), *on_curve)
+    spans = consecutive_curves(len(fixed), [part[0] for part in parts[1:]], [closed for _, closed in raw.curves])
+    named = replace(raw, points=np.concatenate(parts, axis=1), landmarks=names, curves=spans, curve_sliders=NO_SLIDERS)
     known = (specimen.points for specimen in state.specimens if {*names} <= {*specimen.points})
-    first = next(([points[name] for name in names] for points in known), None)
-    return (match_curves(named, None if first is None else np.array(first)) if curves else named), curves
+    first = next((np.array([points[name] for name in names]) for points in known), None)
+    return (match_curves(named, first) if curves else named), curves
 
 
 def _specimen_of_file(stated: str, file: str, state: State) -> str:
-    """Return the name of the specimen of a file with one: the stated name, that of the file, or its beginning."""
-    if _is_known(stated, state):
-        return stated
+    """Return the specimen of a file with one: the stated name, or the longest with which the file's name begins."""
     stem = fold_name(Path(file).stem)
-    begun = [own[0] for own in state.names if re.match(rf"{re.escape(fold_name(own[0]))}[ ._-]", stem)]
-    return Path(file).stem if _is_known(stem, state) else max(begun, key=len, default=Path(file).stem)
+    begun = [name for own in state.names for name in own if re.match(rf"{re.escape(fold_name(name))}([ ._-]|$)", stem)]
+    return stated if _is_known(stated, state) else max(begun, key=len, default=Path(file).stem)
 
 
 def _read(content: bytes, name: str) -> LandmarkConfigurations:

@@ -75,7 +75,7 @@ def placed_landmarks(project: Project, options: Mapping[str, Any]) -> PlacedLand
 
 
 def _landmarks_of(specimens: Sequence[Specimen], state: State, missing: str) -> PlacedLandmarks:
-    points = {specimen.id: _complete_curves(state.curves, specimen) for specimen in specimens}
+    points = {specimen.id: specimen.read_points() for specimen in specimens}
     names, curves = state.point_names, state.curves
     lacking = {name: len(set(names) - set(placed)) for name, placed in points.items()}
     if missing == EXCLUDE_LANDMARKS:
@@ -84,18 +84,3 @@ def _landmarks_of(specimens: Sequence[Specimen], state: State, missing: str) -> 
     is_complete = missing not in MISSING_CHOICES[1:]
     used = {name: placed for name, placed in points.items() if placed and not (is_complete and lacking[name])}
     return PlacedLandmarks(names, used, lacking, curves, _ESTIMATES.get(missing, ""))
-
-
-def _complete_curves(curves: Mapping[str, Curve], specimen: Specimen) -> dict[str, Point]:
-    """Return the landmarks of a specimen with all points of each curve, spaced evenly if some of them are placed; a
-    curve of which too few points are placed is missing.
-    """
-    points = specimen.read_points()
-    for name, curve in curves.items():
-        names = curve.names(name)
-        placed = [points.pop(point) for point in names if point in points]
-        if len(placed) == curve.points:
-            points |= dict(zip(names, placed, strict=True))
-        elif len(placed) > 1 + curve.closed:
-            points |= dict(zip(names, curve.spaced(placed), strict=True))
-    return points

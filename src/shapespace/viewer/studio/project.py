@@ -390,15 +390,14 @@ class Project:
             file.unlink(missing_ok=True)
         return name, same
 
-    def keep_volume(self, file: Path) -> tuple[Path, bool]:
-        """Return the file of an uploaded volume, and whether it is that of an earlier one with the same content, which
-        is used in its place."""
+    def keep_volume(self, file: Path) -> Path:
+        """Return the file of an uploaded volume: an earlier one with the same content, in whose place it is removed."""
         with self._lock:
-            volumes = (path for path in (self.folder / "scans").iterdir() if path.name.lower().endswith(VOLUME_ENDINGS))
-            same = next((path for path in sorted(volumes) if path != file and _is_same(path, file)), None)
+            earlier = sorted(path for path in file.parent.glob("*") if path.name.lower().endswith(VOLUME_ENDINGS))
+            same = next((path for path in earlier if path != file and _is_same(path, file)), None)
             if same is not None:
                 file.unlink()
-            return same or file, same is not None
+            return same or file
 
     def import_files(self, place: Path, role: Role, *, copy: bool) -> tuple[int, list[str]]:
         """Add a scan or the scans of a folder on this machine; return the number of those added, and
@@ -877,15 +876,20 @@ def _set_curve(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
     if not name or not LEAST_LANDMARKS <= curve.points <= MOST_POINTS:
         raise InputError(f"A curve needs a name, and {LEAST_LANDMARKS} to {MOST_POINTS} points.")
     old, new = state.curves.get(name, curve).names(name), curve.names(name)
-    specimens = list[Specimen]()
-    for specimen in state.specimens:
+
+    def with_spaced(specimen: Specimen) -> Specimen:
         placed = [specimen.points[point] for point in old if point in specimen.points]
+        spaced = curve.spaced(placed) if len(placed) > 1 + curve.closed else []
         others = {point: place for point, place in specimen.points.items() if point not in old}
-        spaced = dict(zip(new, curve.spaced(placed), strict=True)) if len(placed) > 1 + curve.closed else {}
-        specimens.append(replace(specimen, points={**others, **spaced}))
-    edited = replace(state, point_names=(), specimens=tuple(specimens), curves={**state.curves, name: curve})
-    _, edited = with_points((*(point for point in state.point_names if point not in old), *new), {})(edited)
-    return f"set the points of the curve {name}", edited
+        return replace(specimen, points=others | dict(zip(new, spaced, strict=False)))
+
+    edited = replace(
+        state,
+        point_names=tuple(point for point in state.point_names if point not in old),
+        specimens=tuple(map(with_spaced, state.specimens)),
+        curves={**state.curves, name: curve},
+    )
+    return f"set the points of the curve {name}", with_points(new, {})(edited)[1]
 
 
 def _set_pair(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
