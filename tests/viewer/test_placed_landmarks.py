@@ -22,7 +22,7 @@ from shapespace.io.landmarks.configuration_io import read_configurations
 from shapespace.statistics.sides import pairs_by_name
 from shapespace.types import FloatArray
 from shapespace.viewer.studio.job_commands import QUESTIONS, checks, order, shapes_of
-from shapespace.viewer.studio.jobs import history
+from shapespace.viewer.studio.jobs import Job, history
 from shapespace.viewer.studio.placed_landmarks import MISSING_CHOICES, MISSING_LANDMARKS, PLACED
 from shapespace.viewer.studio.project import Project
 
@@ -330,6 +330,21 @@ def test_landmarks_in_cm_are_taken_in_the_unit_of_the_scan(project: Project) -> 
         assert np.allclose([*own.read_points().values()], 10.0 * points)  # mm
     take(project, slicer(points, kind="Fiducial", label="p"), "anna.mrk.json")
     assert np.allclose([*project.state.specimens[0].points.values()], points)  # Slicer has the numbers of a mesh
+
+
+def test_a_model_can_wait_for_a_correspondence_that_still_runs(project: Project) -> None:
+    jobs = [
+        Job(number=1, kind="correspond", arguments=("x",), output="correspondence-1", status="done"),
+        Job(number=2, kind="correspond", arguments=("x",), output="correspondence-2", status="running"),
+        Job(number=3, kind="correspond", arguments=("x",), output="correspondence-3", status="failed"),
+    ]
+    made = [order(project, jobs, FORMS, "build", {}, on, 4).arguments[1] for on in (None, 1, 2)]
+    assert made == ["correspondence-1", "correspondence-1", "correspondence-2"]
+    with pytest.raises(InputError, match="needs a correspondence"):
+        order(project, jobs, FORMS, "build", {}, 3, 4)
+    join_table(project, b"id,group\nanna,a\nben,a\ncarl,b\n")
+    found = checks(project, FORMS, "disparity", {"--group": "group"}, shapes_of(project, jobs, "disparity", 2))
+    assert not any("no surface" in one["text"] for one in found)
 
 
 def test_an_answer_from_landmarks_is_computed_again_by_the_history(tmp_path: Path) -> None:

@@ -80,8 +80,8 @@ _QUESTIONS = frozenset(
 )
 _OF_PLACED: Mapping[str, Any] = {
     "flag": MISSING_LANDMARKS, "argument": "", "label": "Missing landmarks", "kind": "choice",
-    "help": "for landmarks on scans: specimens that lack landmarks are excluded, landmarks that specimens lack are "
-    "excluded, or missing landmarks are estimated from the complete specimens, by a thin-plate spline or by regression",
+    "help": "specimens that lack landmarks, or landmarks that specimens lack, are excluded, or missing landmarks are "
+    "estimated; the estimate is from the complete specimens, by a thin-plate spline of their mean or by regression",
     "choices": list(MISSING_CHOICES), "initial": MISSING_CHOICES[0], "visible": True, "required": False,
 }  # fmt: skip
 """Option of questions about the landmarks on scans, for the command that aligns them; changes in mm and identities need
@@ -223,7 +223,7 @@ def forms(commands: Mapping[str, tuple[str, Sequence[Option]]]) -> dict[str, dic
     }  # fmt: skip
     made["score"]["options"][0]["kind"] = "class"
     for kind in _QUESTIONS.union(("morphospace",)) - {"identify", "change"}:
-        made[kind]["options"].insert(0, _OF_PLACED)
+        made[kind]["options"].append(_OF_PLACED)
     return made
 
 

@@ -89,9 +89,9 @@
       const done = points ? await setCurve(name, points, false) : await setNames([...Studio.state.project.point_names, name]);
       if (done) { onadd(points ? `${name.trim()}_1` : name.trim()); setName(""); setPoints(""); }
     };
-    return html`<form class="row" onsubmit=${add}><input required size="14" aria-label=${M.name} placeholder=${M.name} data-testid="mark-name" value=${name} oninput=${(event) => setName(event.target.value)} />
-      <label class="hint">${M.points} <input type="number" min="3" placeholder=${M.pointsHint} data-testid="mark-points" value=${points} oninput=${(event) => setPoints(event.target.value)} /></label>
-      <button class="small" data-testid="mark-add" disabled=${!name.trim()}>${M.add}</button></form>`;
+    return html`<form onsubmit=${add}><div class="row"><input required size="14" aria-label=${M.name} placeholder=${M.name} data-testid="mark-name" value=${name} oninput=${(event) => setName(event.target.value)} />
+      <button class="small" data-testid="mark-add" disabled=${!name.trim()}>${M.add}</button></div>
+      <label class="row hint">${M.pointsOf} <input type="number" min="3" max="500" data-testid="mark-points" value=${points} oninput=${(event) => setPoints(event.target.value)} /></label></form>`;
   }
 
   /** Landmarks of a scan: those of the project by name, in the view and as coordinates. `mirrored`: as the view shows it. */
@@ -180,14 +180,15 @@
   /** A landmark or a curve of the project: its scans, the number of its points, and its mirrored pair. */
   function MarkRow({ name, project }) {
     const { point_names: names, curves, pairs, specimens } = project, curve = curves[name];
+    const [draft, setDraft] = useState(null); // number of points while it is typed
     const points = curve ? pointsOf(curves, name) : [name], onCurves = new Set(Object.keys(curves).flatMap((one) => pointsOf(curves, one)));
     const others = curve ? Object.keys(curves).filter((one) => curves[one].points === curve.points) : names.filter((one) => !onCurves.has(one));
     const pair = pairs.find((one) => one.includes(points[0])), partner = pair && pair.find((one) => one !== points[0]);
     const other = others.find((one) => partner === (curve ? `${one}_1` : one)) || "";
     const locked = Studio.state.read_only;
     return html`<tr><th scope="row">${curve ? M.curve(name) : name}</th><td>${M.of(specimens.filter((one) => points.every((point) => one.points[point])).length, specimens.length)}</td>
-      <td>${curve && html`<input type="number" min="3" aria-label=${M.countOf(name)} data-testid=${`curve-points-${name}`} disabled=${locked} value=${curve.points} onchange=${(event) => setCurve(name, event.target.value, curve.closed)} />
-        <label class="check"><input type="checkbox" aria-label=${M.closedOf(name)} data-testid=${`curve-closed-${name}`} disabled=${locked} checked=${curve.closed} onchange=${(event) => setCurve(name, curve.points, event.target.checked)} />${M.closed}</label>`}</td>
+      <td>${curve && html`<div class="row"><input type="number" min="3" aria-label=${M.countOf(name)} data-testid=${`curve-points-${name}`} disabled=${locked} value=${draft ?? curve.points} oninput=${(event) => setDraft(event.target.value)} onchange=${async () => { await setCurve(name, draft, curve.closed); setDraft(null); }} />
+        <label class="check"><input type="checkbox" aria-label=${M.closedOf(name)} data-testid=${`curve-closed-${name}`} disabled=${locked} checked=${curve.closed} onchange=${(event) => setCurve(name, curve.points, event.target.checked)} />${M.closed}</label></div>`}</td>
       <td><select aria-label=${M.pairOf(name)} data-testid=${`pair-${name}`} disabled=${locked} value=${other} onchange=${(event) => Studio.edit({ what: "pair", name, other: event.target.value })}>
         <option value="">${M.noPair}</option>${others.filter((one) => one !== name).map((one) => html`<option key=${one} value=${one} selected=${one === other}>${one}</option>`)}</select></td>
       <td><${Button} edits small class="quiet" aria-label=${M.removeAll(name)} testid=${`landmark-remove-${name}`} onclick=${() => setNames(names.filter((one) => !points.includes(one)))}>×<//></td></tr>`;

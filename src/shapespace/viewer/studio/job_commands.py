@@ -148,8 +148,8 @@ def order(
         chosen = _require_specimens(state.chosen("training"), "to bring into correspondence", 2)
         files, prepared = project.scan_list(folder / listed, chosen)
         output = f"correspondence-{number}"
-        keys = _keys_of(chosen, scans)
-        return Order((*words, listed, "-o", output, *given), output, prepared, files=files, scans=keys)
+        words = (*words, listed, "-o", output, *given)
+        return Order(words, output, prepared, files=files, scans=_keys_of(chosen, scans))
     if kind == "redo":
         before = result_of(jobs, CORRESPONDENCES, on)
         name = str(options.get("name", ""))
@@ -157,9 +157,8 @@ def order(
         if not chosen:
             raise InputError(f"There is no specimen {name[:40]!r}; choose one of the list.")
         files, prepared = project.scan_list(folder / listed, chosen)
-        keys = _keys_of(chosen, scans)
         redone = (*words, listed, "--redo", name, "-o", before.output)
-        return Order(redone, before.output, prepared, files=files, scans=keys)
+        return Order(redone, before.output, prepared, files=files, scans=_keys_of(chosen, scans))
     if kind == "surface":
         output = f"surfaces/{number:04d}"
         return Order((*words, *stored_volumes(project, options.get("files")), "-o", output, *given), output)
@@ -411,75 +410,73 @@ def checks(
     drop_missing = options.get("--missing") == "drop"
     if drop_missing:
         chosen = [specimen for specimen in chosen if all(specimen.cells.get(column) for column in columns)]
-    found = [{"level": "ok" if len(chosen) >= 2 else "problem", "text": f"Included specimens: {len(chosen)}."}]
+    found = [("ok" if len(chosen) >= 2 else "problem", f"Included specimens: {len(chosen)}.")]
     if kind == "correspond":
         rest = [f"{len(odd) - _MOST_ODD} more specimens differ from the others."] if len(odd) > _MOST_ODD else []
-        return [*found, *({"level": "warning", "text": text} for text in (*odd[:_MOST_ODD], *rest))]
+        return _as_findings([*found, *(("warning", text) for text in (*odd[:_MOST_ODD], *rest))])
     if shapes is not None and shapes.kind in CORRESPONDENCES:
         there = _surface_files(project, shapes, chosen)
         lacking = [specimen.id for specimen in chosen if specimen.id not in there]
-        if lacking:
-            have = "has no surface" if len(lacking) == 1 else "have no surfaces"
-            text = f"{list_names(lacking)} {have} in {shapes.output} and cannot take part."
-            found.append({"level": "warning" if len(chosen) - len(lacking) >= 2 else "problem", "text": text})
+        have = "has no surface" if len(lacking) == 1 else "have no surfaces"
+        text = f"{list_names(lacking)} {have} in {shapes.output} and cannot take part."
+        found += [("warning" if len(chosen) - len(lacking) >= 2 else "problem", text)] if lacking else []
     if shapes is not None and shapes.number == PLACED:
         placed = placed_landmarks(project, options)
         every, excluded = len(project.state.point_names), len(placed.lacking) - len(placed.points)
         lacking = [f"{name} {count} of {every}" for name, count in placed.lacking.items() if count]
         result = f"excluded specimens: {excluded}" if excluded else f"landmarks in use: {len(placed.names)}"
         text = f"Landmarks are missing ({list_names(lacking)}); {result}. Place them, or see {MISSING_LANDMARKS}."
-        found += [{"level": "warning", "text": text}] if lacking else []
+        found += [("warning", text)] if lacking else []
     if kind == "score" and options.get("--reference"):
         members, others = map(len, _by_class(chosen, options["--reference"]))
-        level = "problem" if members < 2 or not others else "warning" if members < 20 else "ok"
         text = f"{members} in the reference, {others} to score; percentiles have steps of 1 in {members + 1}."
-        found.append({"level": level, "text": text})
+        found.append(("problem" if members < 2 or not others else "warning" if members < 20 else "ok", text))
     if kind == "regress" and bool(options.get("--target")) == bool(options.get("--along")):
         text = (
-            "Choose one column, by either --target or --along: to predict a number from shape, or shapes from a number."
+            "Choose one column, by either --target or --along: to predict a number from shape, or shapes from a number"
         )
-        found.append({"level": "problem", "text": text})
+        found.append(("problem", f"{text}."))
     for column in columns:
         cells = [specimen.cells.get(column, "") for specimen in chosen]
         if missing[column]:
             what = "these are excluded" if drop_missing else "fill it in, or exclude these with --set missing=drop"
             text = f"{column} is missing for {missing[column]} of {of_all} specimens; {what}."
-            found.append({"level": "warning" if drop_missing else "problem", "text": text})
+            found.append(("warning" if drop_missing else "problem", text))
         classes = {cell: cells.count(cell) for cell in dict.fromkeys(cells) if cell}
         decimals = [cell for cell in classes if DECIMAL_COMMA.fullmatch(cell)]
         if decimals:
             text = f"{column} has numbers with a decimal comma ({list_names(decimals)}); write a decimal point."
-            found.append({"level": "problem", "text": text})
+            found.append(("problem", text))
         elif len(classes) > 2 and all(map(is_number, classes)) and column != options.get("--group"):
             numbers = sorted(map(float, classes))
-            found.append({"level": "ok", "text": f"{column}: numbers from {numbers[0]:g} to {numbers[-1]:g}."})
+            found.append(("ok", f"{column}: numbers from {numbers[0]:g} to {numbers[-1]:g}."))
         elif 0 < len(classes) <= 12:
-            few = min(classes.values()) < 3
             text = f"{column}: {', '.join(f'{count} {name}' for name, count in classes.items())}."
-            found.append({"level": "warning" if few else "ok", "text": text})
+            found.append(("warning" if min(classes.values()) < 3 else "ok", text))
         elif classes:
-            found.append({"level": "ok", "text": f"{column}: {len(classes)} values."})
+            found.append(("ok", f"{column}: {len(classes)} values."))
         if len(classes) == 1:
-            found.append({"level": "problem", "text": f"{column} has one value for all specimens; nothing can differ."})
+            found.append(("problem", f"{column} has one value for all specimens; nothing can differ."))
     for option in forms.get(kind, {}).get("options", ()):
         value = str(options.get(option["flag"]) or "").strip()
-        text = ""
         if option["required"] and not value:
-            text = f"Choose a value of {option['flag']}."
+            found.append(("problem", f"Choose a value of {option['flag']}."))
         elif value and option["kind"] == "number" and not is_number(value):
-            text = f"{option['flag']}: {value[:40]!r} is not a number."
-        if text:
-            found.append({"level": "problem", "text": text})
-    if not any(finding["level"] == "problem" for finding in found):
+            found.append(("problem", f"{option['flag']}: {value[:40]!r} is not a number."))
+    if not any(level == "problem" for level, _ in found):
         names = [specimen.id for specimen in listed]
         reason, notes = _reason_of_rejection(project, forms, kind, options, shapes, names)
-        found += [{"level": "warning", "text": note} for note in notes]
+        found += [("warning", note) for note in notes]
         for column in columns if reason else ():
             is_group = column in (options.get("--group"), options.get("--points"))
             if is_group and len(chosen) == len({specimen.cells.get(column) for specimen in chosen}):
                 reason = f"{column} has another value for each specimen; choose a column of classes."
-        found += [{"level": "problem", "text": reason}] if reason else []
-    return found
+        found += [("problem", reason)] if reason else []
+    return _as_findings(found)
+
+
+def _as_findings(found: Sequence[tuple[str, str]]) -> list[dict[str, str]]:
+    return [{"level": level, "text": text} for level, text in found]
 
 
 def _reason_of_rejection(
