@@ -130,7 +130,7 @@
     const word = label || (jobs.some((job) => job.kind === kind) ? J.runAgain : J.runOf[kind] || J.run);
     return html`
       <form class="job-form" data-testid=${`form-${kind}`} onsubmit=${run} novalidate>
-        ${running && on !== PLACED && html`<div class="outdated" role="status" data-testid="newer-runs"><strong>${J.newerRuns(action(running.kind), running.number)}</strong>${wait}</div>`}
+        ${running && on !== PLACED && html`<div class="outdated" role="status" data-testid="newer-runs"><strong>${J.newerRuns(action(running.kind), running.number, on === String(running.number))}</strong>${wait}</div>`}
         ${ready.length + placed > 1 && html`<label class="option"><span>${J.source}</span><select data-testid="source" value=${on} onchange=${(event) => setOn(event.target.value)}>
           <option value="">${J.newest}</option>${placed && html`<option value=${PLACED} selected=${on === PLACED}>${J.placed}</option>`}${ready.map((job) => html`<option key=${job.number} value=${job.number}>${titleOf(job)}</option>`)}</select></label>`}
         ${placed && !ready.length && html`<p class="hint" data-testid="of-placed">${J.source}: ${J.placed}</p>`}

@@ -57,7 +57,7 @@
       marks: {
         title: "Landmarks", manage: "Landmarks", placed: (number, all) => `${number} of ${all} landmarks`, of: (number, all) => `${number} of ${all} placed`, missing: "missing", isPlaced: "placed",
         hint: (name) => `Click ${name} on the scan, or type its coordinates. Drag a landmark to move it.`, done: "All landmarks are placed. Drag one to move it.", none: "Name a landmark, then click its place on the scan.",
-        name: "New landmark or curve", points: "Points of a curve", pointsOf: "For a curve, its number of points", add: "Add", closed: "closed", curve: (name) => `${name} (curve)`, pair: "Mirrors", noPair: "(none)", pairOf: (name) => `Mirrored pair of ${name}`, countOf: (name) => `Number of points of ${name}`, closedOf: (name) => `${name} is closed`,
+        name: "New landmark or curve", points: "Points of a curve", pointsOf: "Points of a curve", add: "Add", closed: "closed", curve: (name) => `${name} (curve)`, pair: "Mirrors", noPair: "(none)", pairOf: (name) => `Mirrored pair of ${name}`, countOf: (name) => `Number of points of ${name}`, closedOf: (name) => `${name} is closed`,
         along: (curve) => `Click the points of ${curve} in their order along it. Another number of points, under Landmarks above the cards, spaces them evenly on all scans.`,
         coordinates: (name) => `Coordinates of ${name}`, axis: (axis, name) => `${axis} of ${name}`, file: "In the unit and axes of the file; arrow keys move it in small steps.",
         remove: "Remove from this scan", removeOf: (name) => `Remove ${name} from this scan`, removeAll: (name) => `Remove the landmark ${name} from all scans`, specimens: "Specimens",
@@ -108,7 +108,7 @@
       outdated: {
         specimens: "Made before specimens were changed, excluded or included, or a scan was replaced.", table: "Made before the table was changed.", landmarks: "Made before the landmarks were changed.",
         redone: "Made before a scan was registered again.", source: "Made from a result that is outdated; run that one again first.",
-      }, source: "Made from", newest: "newest result", placed: "Landmarks on the scans", newerRuns: (action, number) => `${action} ${number} is not finished. This run uses an earlier result.`, wait: "Wait for its end, and use its result",
+      }, source: "Made from", newest: "newest result", placed: "Landmarks on the scans", newerRuns: (action, number, waits) => `${action} ${number} is not finished. This run ${waits ? "waits for it" : "uses an earlier result"}.`, wait: "Wait for its end, and use its result",
       progress: ({ doing, done, total }) => total ? `${doing} (${done} of ${total})` : doing, progressLabel: (kind) => `Progress of: ${kind}`,
       took: (time) => `took ${time}`, left: (time) => `about ${time} left in this step`,
       seconds: (value) => `${value} s`, minutes: (value) => `${value} min`, hours: (value) => `${value} h`,
