@@ -21,7 +21,7 @@ from shapespace.types import SurfaceLandmarks
 from shapespace.viewer.studio.job_commands import order
 from shapespace.viewer.studio.jobs import Job, history
 from shapespace.viewer.studio.landmark_import import is_landmark_table, read_points
-from shapespace.viewer.studio.project import Curve, Project, StaleError, with_points
+from shapespace.viewer.studio.project import Project, ScanCurve, StaleError, with_points
 from synthetic_shapes import training_meshes
 
 __all__ = ["own_home", "project"]  # fixtures
@@ -93,7 +93,7 @@ def test_points_of_curves_are_imported_with_the_name_of_their_curve(project: Pro
     assert points(project) == {
         "anna": {"1": (1, 2, 3), "curve 1_1": (1, 1, 1), "curve 1_2": (2, 2, 2), "curve 1_3": (3, 3, 3)}
     }
-    assert project.state.curves == {"curve 1": Curve(3)}
+    assert project.state.curves == {"curve 1": ScanCurve(3)}
 
 
 @pytest.mark.parametrize(("name", "content", "expected"), [

@@ -25,7 +25,7 @@ from shapespace.io.landmarks.landmark_configurations import (
 )
 from shapespace.io.tables.table_io import table_rows
 from shapespace.types import MM_PER_UNIT
-from shapespace.viewer.studio.project import Curve, Point, State, point_of
+from shapespace.viewer.studio.project import Point, ScanCurve, State, point_of
 
 _NUMBERED = re.compile(r"[-_ ]?\d+$")
 """Number at the end of the label of a point."""
@@ -60,7 +60,7 @@ def is_landmark_table(content: bytes, name: str, state: State) -> bool:
 
 def read_points(
     content: bytes, name: str, state: State
-) -> tuple[tuple[str, ...], dict[str, dict[str, Point]], dict[str, Curve], list[str]]:
+) -> tuple[tuple[str, ...], dict[str, dict[str, Point]], dict[str, ScanCurve], list[str]]:
     """Return the names of the landmarks in a file, with those of points of curves, the landmarks of each specimen, the
     curves, and sentences on changed or omitted data and on specimens of the file that the project does not have.
 
@@ -103,15 +103,17 @@ def read_points(
     return names, points, curves, [*notes, *([] if is_single else unmatched)]
 
 
-def _with_named_curves(raw: LandmarkConfigurations, state: State) -> tuple[LandmarkConfigurations, dict[str, Curve]]:
+def _with_named_curves(
+    raw: LandmarkConfigurations, state: State
+) -> tuple[LandmarkConfigurations, dict[str, ScanCurve]]:
     """Return landmarks after whose last one the points of each curve follow, called after it, and the curves."""
     on_curves = {point for points, _ in raw.curves for point in points}
     fixed = [k for k in range(len(raw.landmarks)) if k not in on_curves]
-    parts, curves = [raw.points[:, fixed]], dict[str, Curve]()
+    parts, curves = [raw.points[:, fixed]], dict[str, ScanCurve]()
     for number, (points, closed) in enumerate(raw.curves, 1):
         called = _NUMBERED.sub("", raw.landmarks[points[0]]).strip()
         called = f"curve {number}" if called in curves or _DEFAULT_NAME.fullmatch(called) else called
-        curve = curves[called] = state.curves.get(called, Curve(min(len(points), MOST_CURVE_POINTS), closed))
+        curve = curves[called] = state.curves.get(called, ScanCurve(min(len(points), MOST_CURVE_POINTS), closed))
         own = raw.points[:, points]
         is_equal = len(points) == curve.points
         parts.append(own if is_equal else np.array([resample_polyline(x, curve.points, closed) for x in own]))

@@ -11,15 +11,15 @@ from typing import Any
 from shapespace.cohort.orientation import LINKS
 from shapespace.io.landmarks.configuration_io import CURVE_SLIDERS
 from shapespace.io.tables.table_io import table_text
-from shapespace.viewer.studio.project import Curve, Point, Project, Specimen, State, points_text
+from shapespace.viewer.studio.project import Point, Project, ScanCurve, Specimen, State, points_text
 
 PLACED = 0
 """Number that stands for the landmarks on scans where jobs are given whose shapes a question is about."""
 MISSING_LANDMARKS = "--missing-landmarks"
 """Option of questions about the landmarks on scans, with one of `MISSING_CHOICES`."""
-EXCLUDE_LANDMARKS = "exclude landmarks"
-_ESTIMATES: Mapping[str, str] = {"estimate by spline": "tps", "estimate by regression": "regression"}
-MISSING_CHOICES = ("exclude specimens", EXCLUDE_LANDMARKS, *_ESTIMATES)
+EXCLUDE_LANDMARKS = "exclude-landmarks"
+_ESTIMATES: Mapping[str, str] = {"estimate-by-spline": "tps", "estimate-by-regression": "regression"}
+MISSING_CHOICES = ("exclude-specimens", EXCLUDE_LANDMARKS, *_ESTIMATES)
 """What is done about missing landmarks: specimens that lack some are excluded, landmarks that some specimens lack are
 excluded, or missing landmarks are estimated."""
 
@@ -39,7 +39,7 @@ class PlacedLandmarks:
     names: tuple[str, ...]
     points: Mapping[str, Mapping[str, Point]]
     lacking: Mapping[str, int]
-    curves: Mapping[str, Curve]
+    curves: Mapping[str, ScanCurve]
     estimate: str
 
     def files(self, folder: str) -> dict[str, str]:

@@ -96,7 +96,7 @@ class Specimen(Struct, frozen=True, kw_only=True):
         return {name: (x_mm * x, mm * y, mm * z) for name, (x, y, z) in self.points.items()}
 
 
-class Curve(Struct, frozen=True):
+class ScanCurve(Struct, frozen=True):
     """A curve on the scans, whose points are landmarks called NAME_1, NAME_2 and so on, which slide.
 
     Args:
@@ -139,7 +139,7 @@ class State(Struct, frozen=True, kw_only=True):
     columns: tuple[str, ...] = ()
     specimens: tuple[Specimen, ...] = ()
     point_names: tuple[str, ...] = ()
-    curves: dict[str, Curve] = {}
+    curves: dict[str, ScanCurve] = {}
     pairs: tuple[tuple[str, str], ...] | None = None
     landmarks: dict[str, int] = {}
     landmarks_on: str = ""
@@ -872,7 +872,7 @@ def _set_point_names(state: State, request: Mapping[str, Any]) -> tuple[str, Sta
 
 def _set_curve(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
     """Add a curve, or set the number of its points, which are then spaced evenly on all scans."""
-    name, curve = str(request["name"]).strip(), Curve(int(request["points"]), bool(request["closed"]))
+    name, curve = str(request["name"]).strip(), ScanCurve(int(request["points"]), bool(request["closed"]))
     if not name or not LEAST_LANDMARKS <= curve.points <= MOST_POINTS:
         raise InputError(f"A curve needs a name, and {LEAST_LANDMARKS} to {MOST_POINTS} points.")
     old, new = state.curves.get(name, curve).names(name), curve.names(name)
@@ -902,7 +902,7 @@ def _set_pair(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
 
 
 def with_points(
-    names: Sequence[str], points: Mapping[str, Mapping[str, Point]], curves: Mapping[str, Curve] = {}
+    names: Sequence[str], points: Mapping[str, Mapping[str, Point]], curves: Mapping[str, ScanCurve] = {}
 ) -> Callable[[State], tuple[str, State]]:
     """Return the edit that adds landmarks, with their points by specimen, to those that the project has, and curves.
 
