@@ -186,7 +186,7 @@ def test_a_question_is_outdated_by_edits_of_its_landmarks_and_by_no_others(tmp_p
     done.run("asymmetry", {"--subject": "person"})
     done.run("report")
     assert done.outdated == {} and done.jobs[0].on == PLACED
-    for request, change in (
+    cases: tuple[tuple[dict[str, Any], str | None], ...] = (
         ({"what": "points", "id": "s03", "points": {"left a": [1, 2, 3]}}, "landmarks"),
         ({"what": "points", "id": "s03", "points": {"left a": None}}, "landmarks"),
         ({"what": "point-names", "names": NAMES[:6]}, "landmarks"),
@@ -196,7 +196,8 @@ def test_a_question_is_outdated_by_edits_of_its_landmarks_and_by_no_others(tmp_p
         ({"what": "include", "ids": ["s03"], "included": False}, "specimens"),
         ({"what": "cells", "cells": [{"id": "s03", "column": "person", "value": "q"}]}, "table"),
         ({"what": "cells", "cells": [{"id": "s03", "column": "age", "value": "99"}]}, None),
-    ):  # fmt: skip
+    )  # fmt: skip
+    for request, change in cases:
         edit(made, **request)
         assert done.outdated.get(1) == change, request
         made.undo(made.revision)
