@@ -94,10 +94,17 @@ def test_dropped_volumes_become_specimens_by_a_recorded_command(tmp_path: Path) 
             drop(client, nifti(tmp_path / "other" / "anna.nii.gz", balls(2))),
             drop(client, tmp_path / "other" / "anna.nii.gz"),
         ]
-        assert files == ["scans/anna.nii.gz", "scans/ben.nii.gz", "scans/anna-2.nii.gz", "scans/anna-3.nii.gz"]
+        assert files == ["scans/anna.nii.gz", "scans/ben.nii.gz", "scans/anna-2.nii.gz", "scans/anna-2.nii.gz"]
+        again = client.put("/api/volumes", params={"name": "z.nii.gz"}, content=(tmp_path / "ben.nii.gz").read_bytes())
+        assert again.json() == {"file": "scans/ben.nii.gz", "same_as": "ben.nii.gz"}
+        assert len(list((tmp_path / "p" / "scans").iterdir())) == 3
+        values = balls(2)
+        values[0, 0, 0] = 3  # another volume with the same surface of label 2
+        files[3] = drop(client, nifti(tmp_path / "other" / "anna.nii.gz", values))
+        assert files[3] == "scans/anna-3.nii.gz"
         assert state(client)["specimens"] == []
         labels = [client.post("/api/labels", json={"file": file}).json() for file in files]
-        assert [[label["choice"] for label in one] for one in labels] == [["1", "2"], ["1"], ["2"], ["2"]]
+        assert [[label["choice"] for label in one] for one in labels] == [["1", "2"], ["1"], ["2"], ["2", "3"]]
         run(client, "surface", {"files": files, "set": "new", "--label": "2", "--smooth": "0.8"})
         project = until(client, lambda now: ended(now) and len(now["specimens"]) == 2)
         (job,) = project["jobs"]

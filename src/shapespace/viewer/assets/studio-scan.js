@@ -78,28 +78,35 @@
       <small class="hint">${M.file}</small></fieldset>`;
   };
 
+  const pointsOf = (curves, name) => Array.from({ length: curves[name].points }, (_, k) => `${name}_${k + 1}`);
   const setNames = (names) => Studio.edit({ what: "point-names", names });
 
-  /** A form that adds the name of a landmark. */
+  const setCurve = (name, points, closed) => Studio.edit({ what: "curve", name, points: Number(points), closed });
+
+  /** A form that adds a landmark, or a curve with a number of points. */
   function AddName({ onadd }) {
     const [name, setName] = useState("");
+    const [points, setPoints] = useState("");
     const add = async (event) => {
       event.preventDefault();
-      if (await setNames([...Studio.state.project.point_names, name])) { onadd(name.trim()); setName(""); }
+      const done = points ? await setCurve(name, points, false) : await setNames([...Studio.state.project.point_names, name]);
+      if (done) { onadd(points ? `${name.trim()}_1` : name.trim()); setName(""); setPoints(""); }
     };
-    return html`<form class="row" onsubmit=${add}><input required size="14" aria-label=${M.name} placeholder=${M.name} data-testid="mark-name" value=${name} oninput=${(event) => setName(event.target.value)} />
-      <button class="small" data-testid="mark-add" disabled=${!name.trim()}>${M.add}</button></form>`;
+    return html`<form onsubmit=${add}><div class="row"><input required size="14" aria-label=${M.name} placeholder=${M.name} data-testid="mark-name" value=${name} oninput=${(event) => setName(event.target.value)} />
+      <button class="small" data-testid="mark-add" disabled=${!name.trim()}>${M.add}</button></div>
+      <label class="row hint">${M.pointsOf} <input type="number" min="3" max="500" data-testid="mark-points" value=${points} oninput=${(event) => setPoints(event.target.value)} /></label></form>`;
   }
 
   /** Landmarks of a scan: those of the project by name, in the view and as coordinates. `mirrored`: as the view shows it; `cropping`: ref, whether clicks place a crop. */
   function Landmarks({ specimen, view, box, mirrored, cropping }) {
-    const { point_names: names, undo } = Studio.state.project, { points } = specimen;
+    const { point_names: names, curves, undo } = Studio.state.project, { points } = specimen;
     const [wanted, setChosen] = useState(null);
     const [moving, setMoving] = useState(null); // [name, point] while it is dragged
     const missing = names.filter((name) => !points[name]);
     const chosen = names.includes(wanted) ? wanted : missing[0] || names[0];
     const shown = moving ? { ...points, [moving[0]]: moving[1] } : points;
     const drawn = names.filter((name) => shown[name]);
+    const along = Object.keys(curves).find((curve) => pointsOf(curves, curve).includes(chosen));
     const flipped = ([x, y, z]) => [mirrored ? -x : x, y, z];
     const list = useRef(null), now = useRef({});
     useEffect(() => {
@@ -110,6 +117,14 @@
     useEffect(() => {
       view.marks("marks", drawn.map((name) => ({ position: flipped(shown[name]), label: name, colour: name === chosen ? CHOSEN : PLACED })));
     }, [view, chosen, JSON.stringify(shown), names]);
+    useEffect(() => {
+      view.remove("curves");
+      const lines = Object.keys(curves).flatMap((curve) => {
+        const line = pointsOf(curves, curve).filter((name) => shown[name]).map((name) => flipped(shown[name]));
+        return line.slice(1).flatMap((point, k) => [line[k], point]).concat(curves[curve].closed && line.length > 2 ? [line[line.length - 1], line[0]] : []);
+      });
+      if (lines.length) view.lines("curves", lines, PLACED);
+    }, [view, JSON.stringify(shown), JSON.stringify(curves)]);
     useEffect(() => {
       if (Studio.state.read_only) return undefined;
       const under = (event) => view.pick(event.clientX, event.clientY, ["scan"]);
@@ -154,7 +169,7 @@
     return html`
       <section class="scan-marks" aria-label=${M.title} data-testid="marks">
         <h3>${M.title} <span class="hint" data-testid="marks-count">${names.length > 0 && M.of(names.length - missing.length, names.length)}</span></h3>
-        ${!Studio.state.read_only && html`<p class="hint" role="status">${!names.length ? M.none : missing.length ? M.hint(chosen) : M.done}</p>`}
+        ${!Studio.state.read_only && html`<p class="hint" role="status">${!names.length ? M.none : along ? M.along(along) : missing.length ? M.hint(chosen) : M.done}</p>`}
         <div ref=${list} class="mark-names" role="group" aria-label=${M.title}>${names.map((name) => html`<button type="button" key=${name} class=${points[name] ? "placed" : "missing"} aria-pressed=${name === chosen} data-testid=${`mark-${name}`}
           onclick=${() => setChosen(name)}>${name} <small>${points[name] ? M.isPlaced : M.missing}</small></button>`)}</div>
         ${!Studio.state.read_only && html`
@@ -166,20 +181,37 @@
       </section>`;
   }
 
-  /** The landmarks of the project: on how many scans each is placed, and their export. */
+  /** A landmark or a curve of the project: its scans, the number of its points, and its mirrored pair. */
+  function MarkRow({ name, project }) {
+    const { point_names: names, curves, pairs, specimens } = project, curve = curves[name];
+    const [draft, setDraft] = useState(null); // number of points while it is typed
+    const points = curve ? pointsOf(curves, name) : [name], onCurves = new Set(Object.keys(curves).flatMap((one) => pointsOf(curves, one)));
+    const others = curve ? Object.keys(curves).filter((one) => curves[one].points === curve.points) : names.filter((one) => !onCurves.has(one));
+    const pair = pairs.find((one) => one.includes(points[0])), partner = pair && pair.find((one) => one !== points[0]);
+    const other = others.find((one) => partner === (curve ? `${one}_1` : one)) || "";
+    const locked = Studio.state.read_only;
+    return html`<tr><th scope="row">${curve ? M.curve(name) : name}</th><td>${M.of(specimens.filter((one) => points.every((point) => one.points[point])).length, specimens.length)}</td>
+      <td>${curve && html`<div class="row"><input type="number" min="3" aria-label=${M.countOf(name)} data-testid=${`curve-points-${name}`} disabled=${locked} value=${draft ?? curve.points} oninput=${(event) => setDraft(event.target.value)} onchange=${async () => { await setCurve(name, draft, curve.closed); setDraft(null); }} />
+        <label class="check"><input type="checkbox" aria-label=${M.closedOf(name)} data-testid=${`curve-closed-${name}`} disabled=${locked} checked=${curve.closed} onchange=${(event) => setCurve(name, curve.points, event.target.checked)} />${M.closed}</label></div>`}</td>
+      <td><select aria-label=${M.pairOf(name)} data-testid=${`pair-${name}`} disabled=${locked} value=${other} onchange=${(event) => Studio.edit({ what: "pair", name, other: event.target.value })}>
+        <option value="">${M.noPair}</option>${others.filter((one) => one !== name).map((one) => html`<option key=${one} value=${one} selected=${one === other}>${one}</option>`)}</select></td>
+      <td><${Button} edits small class="quiet" aria-label=${M.removeAll(name)} testid=${`landmark-remove-${name}`} onclick=${() => setNames(names.filter((one) => !points.includes(one)))}>×<//></td></tr>`;
+  }
+
+  /** The landmarks of the project: on how many scans each is placed, their curves and mirrored pairs, and their export. */
   Studio.ManageLandmarks = function ManageLandmarks({ project }) {
     const [open, setOpen] = useState(false);
-    const { point_names: names, specimens } = project;
+    const { point_names: names, curves } = project;
     if (!names.length) return null;
     const done = Studio.newest("landmarks");
+    const onCurves = new Set(Object.keys(curves).flatMap((one) => pointsOf(curves, one)));
     return html`<${Button} testid="landmarks-all" onclick=${() => setOpen(true)}>${M.manage}<//>
       ${open && html`
         <${Dialog} title=${M.title} testid="landmarks-dialog" onclose=${() => setOpen(false)} wide>
           <p class="hint">${M.intro}</p>
           <div class="table-box preview" role="region" aria-label=${M.title} tabindex="0"><table class="plain">
-            <thead><tr><th scope="col">${M.title}</th><th scope="col">${M.specimens}</th><th scope="col"><span class="hidden">${S.remove}</span></th></tr></thead>
-            <tbody>${names.map((name) => html`<tr key=${name}><th scope="row">${name}</th><td>${M.of(specimens.filter((one) => one.points[name]).length, specimens.length)}</td>
-              <td><${Button} edits small class="quiet" aria-label=${M.removeAll(name)} testid=${`landmark-remove-${name}`} onclick=${() => setNames(names.filter((other) => other !== name))}>×<//></td></tr>`)}</tbody></table></div>
+            <thead><tr><th scope="col">${M.title}</th><th scope="col">${M.specimens}</th><th scope="col">${M.points}</th><th scope="col">${M.pair}</th><th scope="col"><span class="hidden">${S.remove}</span></th></tr></thead>
+            <tbody>${[...names.filter((name) => !onCurves.has(name)), ...Object.keys(curves)].map((name) => html`<${MarkRow} key=${name} name=${name} project=${project} />`)}</tbody></table></div>
           ${!Studio.state.read_only && html`<${Studio.JobForm} kind="landmarks" label=${Studio.action("landmarks")} />`}
           <${Studio.Jobs} kinds=${["landmarks"]} />
           ${done && html`<${Studio.Outdated} job=${done} />`}

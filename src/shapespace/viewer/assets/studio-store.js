@@ -214,7 +214,9 @@
   /** Add a label volume; its labels are asked for when all files of the drop are there. */
   async function uploadVolume(file, set) {
     checkSize(file, T.uploads.volumeTooLarge);
-    const { file: stored } = await json(`/api/volumes?name=${encodeURIComponent(file.name)}`, { method: "PUT", body: file });
+    const { file: stored, same_as: same } = await json(`/api/volumes?name=${encodeURIComponent(file.name)}`, { method: "PUT", body: file });
+    if (same) Studio.uploads.notes.push(T.uploads.same(file.name, same));
+    if (Studio.volumes.some((volume) => volume.file === stored)) return;
     Studio.volumes.push({ file: stored, name: file.name, set });
     Studio.volumes.sort((a, b) => byName(a.name, b.name));
   }

@@ -60,7 +60,7 @@ from shapespace.viewer.studio.job_commands import (
     stored_volumes,
 )
 from shapespace.viewer.studio.jobs import Job, Jobs, Order, history
-from shapespace.viewer.studio.landmark_import import is_landmark_table, points_of_file
+from shapespace.viewer.studio.landmark_import import is_landmark_table, read_points
 from shapespace.viewer.studio.project import (
     PastedBlock,
     Project,
@@ -221,6 +221,7 @@ class OpenProject:
             "undo": project.undo_text, "redo": project.redo_text, "landmarks": state.landmarks,
             "landmarks_on": state.landmarks_on, "point_names": list(state.point_names),
             "views": to_builtins(state.views),
+            "curves": to_builtins(state.curves), "pairs": state.mirrored_pairs,
             "jobs": [self._job(job) for job in jobs],
         }  # fmt: skip
 
@@ -446,7 +447,9 @@ class Studio:
         if not name.lower().endswith(_VOLUME_ENDINGS):
             raise HTTPException(415, f"{name} is not a volume that can be read; drop {', '.join(_VOLUME_ENDINGS)}.")
         target = await self._store(request, name)
-        return json_response({"file": target.relative_to(self._project.project.folder).as_posix()}, 201)
+        kept = await run_in_threadpool(self._project.project.keep_volume, target)
+        same_as = None if kept == target else kept.name
+        return json_response({"file": f"{kept.parent.name}/{kept.name}", "same_as": same_as}, 201)
 
     async def _labels_of_volume(self, request: Request) -> Response:
         content = await json_body(request, _REQUEST_BYTES)
@@ -510,8 +513,8 @@ class Studio:
 
     async def _take_landmarks(self, content: bytes, name: str) -> Response:
         project = self._project.project
-        names, points, notes = await run_in_threadpool(points_of_file, content, name, project.state)
-        await run_in_threadpool(project.edit, None, with_points(names, points), together="import landmarks")
+        names, points, curves, notes = await run_in_threadpool(read_points, content, name, project.state)
+        await run_in_threadpool(project.edit, None, with_points(names, points, curves), together="import landmarks")
         self._changed()
         return json_response({"matched": len(points), "landmarks": len(names), "notes": notes})
 
@@ -546,7 +549,7 @@ class Studio:
         opened, shapes = self._project, None
         if kind in QUESTIONS:
             try:
-                shapes = shapes_of(opened.jobs.all(), kind, on)
+                shapes = shapes_of(opened.project, opened.jobs.all(), kind, on)
             except InputError as error:
                 return json_response([{"level": "problem", "text": str(error)}])
         given = cast(dict[str, Any], options) if isinstance(options, dict) else {}

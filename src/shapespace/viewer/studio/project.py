@@ -16,10 +16,10 @@ from contextlib import contextmanager, suppress
 from functools import lru_cache
 from itertools import count
 from math import isfinite
-from operator import mul
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeAlias, cast
+from typing import Any, ClassVar, Literal, TypeAlias, TypeVar, cast
 
+import numpy as np
 from msgspec import Struct, to_builtins
 from msgspec.structs import replace
 
@@ -37,16 +37,19 @@ from shapespace.cohort.table import (
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.containers.json_files import read_json
 from shapespace.io.files import atomic_path, make_folder, write_error, write_text
+from shapespace.io.landmarks.landmark_configurations import resample_polyline
 from shapespace.io.landmarks.landmark_io import read_surface_landmarks, surface_landmarks_text
 from shapespace.io.meshes.mesh_io import MESH_FILE_ENDINGS, mesh_files, stem_of
 from shapespace.io.tables.table_io import DECIMAL_COMMA, KEYS, MISSING, key_column, table_text
 from shapespace.io.volume_io import VOLUME_ENDINGS
 from shapespace.schemas import NamedView, Orientation, read
+from shapespace.statistics.sides import pairs_by_name
 from shapespace.store.corresponding import LANDMARKS
 from shapespace.types import MM_PER_UNIT, SurfaceLandmarks
 
 Role = Literal["training", "new"]
 Point: TypeAlias = tuple[float, float, float]
+_Made = TypeVar("_Made")
 
 _AGAIN = "restore it from a copy, or start a new project"
 _MOST_CLASSES = 12  # classes of a column that the page counts
@@ -58,7 +61,7 @@ MOST_POINTS = 500
 """Largest number of names of landmarks, which the page lists for each scan."""
 _LONGEST_NAME = 60  # characters of the name of a landmark
 _MOST_UNDONE = 100  # edits that can be undone
-_MOST_TABLES = 32  # texts of tables that are kept: jobs read those of few sets of specimens
+_MOST_MADE = 32  # tables and landmarks that are cached: jobs read those of few sets of specimens
 _BEGINNING, _MOST_HASHES = 2**14, 2**15  # bytes of a file that are hashed, and hashes in memory
 _LONGEST_ID, _LONGEST_CELL = 100, 1000  # characters
 _NO_FILE_NAME = re.compile(r'[/\\:*?"<>|\x00-\x1f]')
@@ -90,6 +93,33 @@ class Specimen(Struct, frozen=True, kw_only=True):
     cells: dict[str, str] = {}
     points: dict[str, Point] = {}
 
+    def read_points(self) -> dict[str, Point]:
+        """Return the landmarks on the scan that commands read: in mm if it has a unit, and reflected if mirrored."""
+        mm = MM_PER_UNIT[self.unit] if self.unit else 1.0
+        x_mm = -mm if self.mirrored else mm
+        return {name: (x_mm * x, mm * y, mm * z) for name, (x, y, z) in self.points.items()}
+
+
+class ScanCurve(Struct, frozen=True):
+    """A curve on the scans, whose points are landmarks called NAME_1, NAME_2 and so on, which slide.
+
+    Args:
+        points: number of points.
+        closed: whether the first point follows the last.
+    """
+
+    points: int
+    closed: bool = False
+
+    def names(self, name: str) -> tuple[str, ...]:
+        """Return the names of the points of the curve called `name`."""
+        return tuple(f"{name}_{k}" for k in range(1, self.points + 1))
+
+    def spaced(self, points: Sequence[Point]) -> list[Point]:
+        """Return the points of the curve at equal distances along others in their order, two or more."""
+        spaced = resample_polyline(np.array(points), self.points, self.closed)
+        return [point_of(point) for point in spaced.tolist()]
+
 
 class State(Struct, frozen=True, kw_only=True):
     """Content of `project.json`.
@@ -99,6 +129,8 @@ class State(Struct, frozen=True, kw_only=True):
         columns: columns of the table, except the id.
         specimens: specimens in the order in which they were added.
         point_names: names of the landmarks on scans, in their order in files.
+        curves: name -> curve whose points are among these landmarks.
+        pairs: pairs of names of landmarks that mirror each other; None for those that their names show.
         landmarks: name -> vertex of the surfaces in correspondence.
         landmarks_on: folder of these surfaces in the project.
         views: folder of surfaces -> named views in the frame of their mean shape; those of the key "" are in the frames
@@ -113,6 +145,8 @@ class State(Struct, frozen=True, kw_only=True):
     columns: tuple[str, ...] = ()
     specimens: tuple[Specimen, ...] = ()
     point_names: tuple[str, ...] = ()
+    curves: dict[str, ScanCurve] = {}
+    pairs: tuple[tuple[str, str], ...] | None = None
     landmarks: dict[str, int] = {}
     landmarks_on: str = ""
     views: dict[str, tuple[NamedView, ...]] = {}
@@ -121,6 +155,17 @@ class State(Struct, frozen=True, kw_only=True):
     def names(self) -> list[tuple[str, ...]]:
         """The names by which a table can refer to each specimen: its id, and names of its file."""
         return [(specimen.id, *names_of_file(Path(specimen.file).name)) for specimen in self.specimens]
+
+    @property
+    def curve_points(self) -> frozenset[str]:
+        """The names of the landmarks that are points of curves."""
+        return frozenset(point for name, curve in self.curves.items() for point in curve.names(name))
+
+    @property
+    def mirrored_pairs(self) -> tuple[tuple[str, str], ...]:
+        """The pairs of landmarks that mirror each other: those that the user chose, or that the names show."""
+        found = pairs_by_name(self.point_names) if self.pairs is None else self.pairs
+        return tuple(pair for pair in found if {*pair} <= {*self.point_names})
 
     def chosen(self, role: Role) -> tuple[Specimen, ...]:
         """Return the included specimens of a role by name: the order in which they were added differs between drops."""
@@ -160,7 +205,7 @@ class Project:
         self.revision = 0
         self._undo: list[tuple[str, State]] = []
         self._redo: list[tuple[str, State]] = []
-        self._tables: list[tuple[tuple[object, ...], str]] = []
+        self._made: list[tuple[tuple[object, ...], Any]] = []
         self._lock = threading.RLock()
 
     @staticmethod
@@ -367,6 +412,15 @@ class Project:
             file.unlink(missing_ok=True)
         return name, same
 
+    def keep_volume(self, file: Path) -> Path:
+        """Return the file of an uploaded volume: an earlier one with the same content, in whose place it is removed."""
+        with self._lock:
+            earlier = sorted(path for path in file.parent.glob("*") if path.name.lower().endswith(VOLUME_ENDINGS))
+            same = next((path for path in earlier if path != file and filecmp.cmp(path, file, shallow=False)), None)
+            if same is not None:
+                file.unlink()
+            return same or file
+
     def import_files(self, place: Path, role: Role, *, copy: bool) -> tuple[int, list[str]]:
         """Add a scan or the scans of a folder on this machine; return the number of those added, and
         sentences on the scans that are not.
@@ -465,12 +519,20 @@ class Project:
     def table(self, specimens: Iterable[Specimen]) -> str:
         """Return the table of specimens, as `compare` reads it."""
         columns, chosen = self.state.columns, tuple(specimens)
-        text = next((text for known, text in self._tables if known == (columns, chosen)), None)
-        if text is None:  # all jobs ask for it after each edit
+
+        def make() -> str:
             rows = [(specimen.id, *(specimen.cells.get(column, "") for column in columns)) for specimen in chosen]
-            text = table_text(("specimen", *columns), rows)
-            self._tables = [((columns, chosen), text), *self._tables[: _MOST_TABLES - 1]]
-        return text
+            return table_text(("specimen", *columns), rows)
+
+        return self.cached((columns, chosen), make)
+
+    def cached(self, key: tuple[object, ...], make: Callable[[], _Made]) -> _Made:
+        """Return the result of `make` for a key, computed once: all jobs ask for it after each edit."""
+        made = next((made for known, made in self._made if known == key), None)
+        if made is None:
+            made = make()
+            self._made = [(key, made), *self._made[: _MOST_MADE - 1]]
+        return made
 
     def landmark_table(self, surfaces: str) -> str:
         """Return the landmarks of the surfaces in a folder as a table: those that the user placed on them, and those
@@ -482,32 +544,35 @@ class Project:
         return surface_landmarks_text(others.joined(placed))
 
     def point_table(self, specimens: Iterable[Specimen]) -> str:
-        """Return the landmarks on scans, in the frames and units of their files, as a table with a row for each one, as
-        `landmarks convert` reads it; specimens are sorted by name.
-        """
-        rows = [
-            (specimen.id, name, *specimen.points.get(name, ("NA",) * 3))
-            for specimen in sorted(specimens, key=lambda specimen: name_key(specimen.id))
-            for name in self.state.point_names
-        ]
-        return table_text(("specimen", "landmark", *"xyz"), rows)
+        """Return the landmarks on scans, in the frames and units of their files, as `landmarks convert` reads them."""
+        return points_text({specimen.id: specimen.points for specimen in specimens}, self.state.point_names)
 
     def _landmark_texts(self, specimens: Iterable[Specimen], names: Collection[str] | None) -> dict[str, str]:
         """Return id -> table of the landmarks of each specimen that has some, as they are on the scan that commands
-        read: in mm if it has a unit, and reflected if it is mirrored. See `scan_list` for `names`.
+        read, without points of curves, which are not at the same place. See `scan_list` for `names`.
         """
         texts: dict[str, str] = {}
+        on_curves = self.state.curve_points
         for specimen in specimens:
-            mm = MM_PER_UNIT[specimen.unit] if specimen.unit else 1.0
-            factors = (-mm if specimen.mirrored else mm, mm, mm)
+            points = specimen.read_points()
             rows = [
-                (name, *map(mul, factors, specimen.points[name]))
+                (name, *points[name])
                 for name in self.state.point_names
-                if name in specimen.points and (names is None or name in names)
+                if name in points and name not in on_curves and (names is None or name in names)
             ]
             if len(rows) >= (1 if names is None else LEAST_LANDMARKS):
                 texts[specimen.id] = table_text(("name", *"xyz"), rows)
         return texts
+
+
+def points_text(points: Mapping[str, Mapping[str, Point]], names: Sequence[str]) -> str:
+    """Return the landmarks of specimens as a table with a row for each one; specimens are sorted by name."""
+    rows = [
+        (specimen, name, *points[specimen].get(name, ("NA",) * 3))
+        for specimen in sorted(points, key=name_key)
+        for name in names
+    ]
+    return table_text(("specimen", "landmark", *"xyz"), rows)
 
 
 class MatchedBlock(Struct, frozen=True, kw_only=True):
@@ -647,7 +712,7 @@ def change_of(request: Mapping[str, Any]) -> Callable[[State], tuple[str, State]
         "cells": _edit_cells, "block": _edit_block, "include": _include, "set": _set_role, "remove": _remove,
         "rename": _rename, "unit": _set_unit, "mirror": _mirror, "original": _use_original, "add-column": _add_column,
         "remove-column": _remove_column, "landmarks": _set_landmarks, "points": _edit_points,
-        "point-names": _set_point_names, "views": _set_views,
+        "point-names": _set_point_names, "views": _set_views, "curve": _set_curve, "pair": _set_pair,
     }  # fmt: skip
 
     def change(state: State) -> tuple[str, State]:
@@ -842,14 +907,46 @@ def _set_point_names(state: State, request: Mapping[str, Any]) -> tuple[str, Sta
         replace(specimen, points={name: point for name, point in specimen.points.items() if name in names})
         for specimen in state.specimens
     )
-    _, edited = with_points(names, {})(replace(state, point_names=(), specimens=specimens))
+    curves = {name: curve for name, curve in state.curves.items() if {*curve.names(name)} <= {*names}}
+    _, edited = with_points(names, {})(replace(state, point_names=(), specimens=specimens, curves=curves))
     return "change the names of landmarks", edited
 
 
+def _set_curve(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
+    """Add a curve, or set the number of its points, which are then spaced evenly on all scans."""
+    name, curve = str(request["name"]).strip(), ScanCurve(int(request["points"]), bool(request["closed"]))
+    if not name or not LEAST_LANDMARKS <= curve.points <= MOST_POINTS:
+        raise InputError(f"A curve needs a name, and {LEAST_LANDMARKS} to {MOST_POINTS} points.")
+    old, new = state.curves.get(name, curve).names(name), curve.names(name)
+
+    def with_spaced(specimen: Specimen) -> Specimen:
+        placed = [specimen.points[point] for point in old if point in specimen.points]
+        spaced = curve.spaced(placed) if len(placed) > 1 + curve.closed else []
+        others = {point: place for point, place in specimen.points.items() if point not in old}
+        return replace(specimen, points=others | dict(zip(new, spaced, strict=False)))
+
+    edited = replace(
+        state,
+        point_names=tuple(point for point in state.point_names if point not in old),
+        specimens=tuple(map(with_spaced, state.specimens)),
+        curves={**state.curves, name: curve},
+    )
+    return f"set the points of the curve {name}", with_points(new, {})(edited)[1]
+
+
+def _set_pair(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
+    """Let two landmarks, or two curves, mirror each other, or one of them none."""
+    name, other = str(request["name"]), str(request["other"])
+    points, others = (state.curves[end].names(end) if end in state.curves else (end,) for end in (name, other))
+    kept = [pair for pair in state.mirrored_pairs if not {*pair} & {*points, *others}]
+    pairs = (*kept, *zip(points, others, strict=False)) if other else tuple(kept)
+    return f"set the mirrored pair of {name}", replace(state, pairs=pairs)
+
+
 def with_points(
-    names: Sequence[str], points: Mapping[str, Mapping[str, Point]]
+    names: Sequence[str], points: Mapping[str, Mapping[str, Point]], curves: Mapping[str, ScanCurve] = {}
 ) -> Callable[[State], tuple[str, State]]:
-    """Return the edit that adds landmarks, with their points by specimen, to those that the project has.
+    """Return the edit that adds landmarks, with their points by specimen, to those that the project has, and curves.
 
     Raises:
         InputError: by the edit, if a name cannot be in a table of landmarks, or there are too many names.
@@ -867,7 +964,8 @@ def with_points(
         edited = _edit_specimens(
             state, points, lambda specimen: replace(specimen, points={**specimen.points, **points[specimen.id]})
         )
-        return f"take landmarks of {_count_text(points)}", replace(edited, point_names=together)
+        edited = replace(edited, point_names=together, curves={**state.curves, **curves})
+        return f"take landmarks of {_count_text(points)}", edited
 
     return change
 
