@@ -193,8 +193,10 @@ class _Side:
             (forward, i), (backward, k) = self.near.query(there), other.near.query(back)
             if step == _ITERATIONS:
                 break
-            a = np.concatenate([self.points[i], np.broadcast_to(own, back.shape)], axis=1)
-            b = np.concatenate([np.broadcast_to(theirs, there.shape), other.points[k]], axis=1)
+            a, b = (
+                np.concatenate(np.broadcast_arrays(*points), axis=1)
+                for points in ((self.points[i], own), (theirs, other.points[k]))
+            )
             distances = np.concatenate([forward, backward], axis=1)
             w = (1.0 + (distances / (2.0 * np.median(distances, axis=1, keepdims=True))) ** 2)[..., None] ** -2
             mean_a, mean_b = ((w * x).sum(axis=1, keepdims=True) / w.sum(axis=1, keepdims=True) for x in (a, b))
@@ -202,11 +204,11 @@ class _Side:
             u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
             R = u @ vt
             t = (mean_a - mean_b @ R.transpose(0, 2, 1))[:, 0]
-        to_planes = [
+        to_planes = (
             np.abs(((moved - side.points[near]) * side.normals[near]).sum(axis=-1)).mean(axis=1)
             for moved, side, near in ((there, self, i), (back, other, k))
-        ]
-        return float(np.sum(to_planes, axis=0).min())
+        )
+        return float(np.sum(list(to_planes), axis=0).min())
 
 
 def find_mirrored_scans(samples: Sequence[FloatArray]) -> list[int]:
@@ -221,8 +223,8 @@ def find_mirrored_scans(samples: Sequence[FloatArray]) -> list[int]:
     count = len(samples)
     if count < _LEAST_SIDES:
         return []
-    sides, anchors = [_Side(sample) for sample in samples], (0, count // 2)
-    images = [_Side(sample * np.tile(FLIP, 2)) for sample in samples]
+    sides, images = ([_Side(sample * factors) for sample in samples] for factors in (1.0, np.tile(FLIP, 2)))
+    anchors = (0, count // 2)
     evidence = np.array(
         [
             [
