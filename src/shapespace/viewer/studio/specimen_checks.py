@@ -83,8 +83,8 @@ class SpecimenChecks:
     def sample(self, scan: Path, *, mirrored: bool) -> FloatArray | None:
         """Return the sample of a scan or of its mirror image, (P, 6), see `side_sample`; None if there is none."""
         file = self.picture(scan).with_suffix(_SAMPLE)
-        values = np.fromfile(file, dtype=np.float32).reshape(-1, 6) if file.is_file() else None
-        return values if values is None else values * (np.tile(FLIP, 2) if mirrored else 1.0)
+        factors = np.tile(FLIP, 2) if mirrored else np.ones(6)
+        return np.fromfile(file, dtype=np.float32).reshape(-1, 6) * factors if file.is_file() else None
 
     def surface(self, scan: Path, *, mirrored: bool) -> Future[bytes]:
         """Return the packed surface of a scan for a view, as it is in its file or reflected at x = 0.
