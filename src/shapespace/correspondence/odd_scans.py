@@ -192,8 +192,8 @@ class _Side:
         align their principal axes."""
         R = self.axes @ _TURNS @ other.axes.T
         far = self.nearest(other.points[:_COARSE] @ R.transpose(0, 2, 1))[0].mean(axis=1)
-        R, own, theirs = R[far.argsort()[:_STARTS]], self.points[:_MATCHED], other.points[:_MATCHED]
-        t = np.zeros((len(R), 3))
+        R, t = R[far.argsort()[:_STARTS]], np.zeros((_STARTS, 3))
+        own, theirs = self.points[:_MATCHED], other.points[:_MATCHED]
         for _ in range(_ITERATIONS):
             there, back = theirs @ R.transpose(0, 2, 1) + t[:, None], (own - t[:, None]) @ R
             (forward, y, _), (backward, x, _) = self.nearest(there), other.nearest(back)
@@ -203,8 +203,7 @@ class _Side:
             mean_a, mean_b = ((w * c).sum(axis=1, keepdims=True) / w.sum(axis=1, keepdims=True) for c in (a, b))
             u, _, vt = np.linalg.svd((w * (a - mean_a)).transpose(0, 2, 1) @ (b - mean_b))
             u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
-            R = u @ vt
-            t = (mean_a - mean_b @ R.transpose(0, 2, 1))[:, 0]
+            R, t = u @ vt, (mean_a - mean_b @ (u @ vt).transpose(0, 2, 1))[:, 0]
         there, back = theirs @ R.transpose(0, 2, 1) + t[:, None], (own - t[:, None]) @ R
         matches = ((there, self.nearest(there)), (back, other.nearest(back)))
         to_planes = [np.abs(((places - p) * n).sum(axis=-1)).mean(axis=1) for places, (_, p, n) in matches]
