@@ -51,8 +51,7 @@ def number(text: str) -> float:
 
 def _decimal(text: str) -> float:
     """Return a number with a decimal point or comma; 1,000 is rejected, as it may be a thousand."""
-    has_comma = DECIMAL_COMMA.fullmatch(text) and not _THOUSANDS.fullmatch(text)
-    return float(text.replace(",", ".") if has_comma else text)
+    return float(text if _THOUSANDS.fullmatch(text) or not DECIMAL_COMMA.fullmatch(text) else text.replace(",", "."))
 
 
 def probability(text: str) -> float:

@@ -182,30 +182,31 @@ class _Side:
         self.axes = np.linalg.eigh(self.points.T @ self.points)[1]
         self.axes[:, 2] *= np.linalg.det(self.axes)
 
+    def nearest(self, places: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the distances (S, N) of places (S, N, 3), and the points and normals (S, N, 3) that are nearest."""
+        distances, k = self.near.query(places)
+        return np.asarray(distances), self.points[k], self.normals[k]
+
     def distance(self, other: _Side) -> float:
         """Return the mean distance between two surfaces in their best pose: rigid ICP from some of the 24 poses that
         align their principal axes."""
         R = self.axes @ _TURNS @ other.axes.T
-        R = R[self.near.query(other.points[:_COARSE] @ R.transpose(0, 2, 1))[0].mean(axis=1).argsort()[:_STARTS]]
-        t, own, theirs = np.zeros((len(R), 3)), self.points[:_MATCHED], other.points[:_MATCHED]
-        for step in range(_ITERATIONS + 1):
+        far = self.nearest(other.points[:_COARSE] @ R.transpose(0, 2, 1))[0].mean(axis=1)
+        R, t = R[far.argsort()[:_STARTS]], np.zeros((_STARTS, 3))
+        own, theirs = self.points[:_MATCHED], other.points[:_MATCHED]
+        for _ in range(_ITERATIONS):
             there, back = theirs @ R.transpose(0, 2, 1) + t[:, None], (own - t[:, None]) @ R
-            (forward, i), (backward, k) = self.near.query(there), other.near.query(back)
-            if step == _ITERATIONS:
-                break
-            a = np.concatenate([self.points[i], np.broadcast_to(own, back.shape)], axis=1)
-            b = np.concatenate([np.broadcast_to(theirs, there.shape), other.points[k]], axis=1)
+            (forward, y, _), (backward, x, _) = self.nearest(there), other.nearest(back)
+            a, b = (np.concatenate(np.broadcast_arrays(*points), axis=1) for points in ((y, own), (theirs, x)))
             distances = np.concatenate([forward, backward], axis=1)
             w = (1.0 + (distances / (2.0 * np.median(distances, axis=1, keepdims=True))) ** 2)[..., None] ** -2
-            mean_a, mean_b = ((w * x).sum(axis=1, keepdims=True) / w.sum(axis=1, keepdims=True) for x in (a, b))
+            mean_a, mean_b = ((w * c).sum(axis=1, keepdims=True) / w.sum(axis=1, keepdims=True) for c in (a, b))
             u, _, vt = np.linalg.svd((w * (a - mean_a)).transpose(0, 2, 1) @ (b - mean_b))
             u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
-            R = u @ vt
-            t = (mean_a - mean_b @ R.transpose(0, 2, 1))[:, 0]
-        to_planes = [
-            np.abs(((moved - side.points[near]) * side.normals[near]).sum(axis=-1)).mean(axis=1)
-            for moved, side, near in ((there, self, i), (back, other, k))
-        ]
+            R, t = u @ vt, (mean_a - mean_b @ (u @ vt).transpose(0, 2, 1))[:, 0]
+        there, back = theirs @ R.transpose(0, 2, 1) + t[:, None], (own - t[:, None]) @ R
+        matches = ((there, self.nearest(there)), (back, other.nearest(back)))
+        to_planes = [np.abs(((places - p) * n).sum(axis=-1)).mean(axis=1) for places, (_, p, n) in matches]
         return float(np.sum(to_planes, axis=0).min())
 
 
@@ -221,8 +222,8 @@ def find_mirrored_scans(samples: Sequence[FloatArray]) -> list[int]:
     count = len(samples)
     if count < _LEAST_SIDES:
         return []
-    sides, anchors = [_Side(sample) for sample in samples], (0, count // 2)
-    images = [_Side(sample * np.tile(FLIP, 2)) for sample in samples]
+    sides, images = ([_Side(sample * factors) for sample in samples] for factors in (1.0, np.tile(FLIP, 2)))
+    anchors = (0, count // 2)
     evidence = np.array(
         [
             [
@@ -234,9 +235,8 @@ def find_mirrored_scans(samples: Sequence[FloatArray]) -> list[int]:
             for anchor in anchors
         ]
     )
-    first, second = np.sign(evidence)
+    first, second = np.sign(evidence[0]), np.sign(evidence[1])
     second = np.where(np.arange(count) == anchors[1], first, second * first[anchors[1]])
     if np.abs(evidence).min() <= ASYMMETRIC or (first != second).any():
         return []
-    is_mirrored = first < 0
-    return np.flatnonzero(~is_mirrored if 2 * is_mirrored.sum() > count else is_mirrored).tolist()
+    return np.flatnonzero(first == (1.0 if 2 * (first < 0).sum() > count else -1.0)).tolist()

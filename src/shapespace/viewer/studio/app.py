@@ -25,7 +25,6 @@ from starlette.types import ASGIApp
 from shapespace.batch.result_folder import LOCK, only_writer
 from shapespace.correspondence.odd_scans import OddScan, ScanMeasures, find_mirrored_scans, find_odd_scans
 from shapespace.errors import FileError, InputError
-from shapespace.geometry.mirror_plane import FLIP
 from shapespace.io.containers.json_files import plain_json
 from shapespace.io.files import atomic_path
 from shapespace.io.landmarks.configuration_io import CONFIGURATION_ENDINGS
@@ -172,14 +171,12 @@ class OpenProject:
             (specimen.id, specimen.mirrored, scan_key(project.path(specimen), project.folder)) for specimen in chosen
         ]
         if key != self._mirrored[0]:
-            samples = [(specimen, self.checks.sample(project.path(specimen))) for specimen in chosen]
-            known = [
-                (specimen.id, sample * np.tile(FLIP, 2) if specimen.mirrored else sample)
-                for specimen, sample in samples
-                if sample is not None
-            ]
-            found = find_mirrored_scans([sample for _, sample in known])
-            self._mirrored = key, [known[k][0] for k in found]
+            samples = {
+                specimen.id: self.checks.sample(project.path(specimen), mirrored=specimen.mirrored)
+                for specimen in chosen
+            }
+            known = {name: sample for name, sample in samples.items() if sample is not None}
+            self._mirrored = key, [list(known)[k] for k in find_mirrored_scans(list(known.values()))]
         return self._mirrored[1]
 
     def scan_contents(self) -> dict[str, str]:

@@ -7,7 +7,6 @@ import filecmp
 import hashlib
 import io
 import json
-import os
 import re
 import threading
 from collections import Counter
@@ -371,13 +370,11 @@ class Project:
     def _add_all(self, files: Sequence[tuple[Path, str]], role: Role) -> list[tuple[str, str | None]]:
         """Add scans, each with the name of its file for the user, by one edit; see `add`."""
         with self._lock:
-            state, specimens = self.state, list[Specimen]()
-            taken = {specimen.id.casefold() for specimen in state.specimens}
+            specimens, added = list[Specimen](), list[tuple[str, str | None]]()
+            taken = {specimen.id.casefold() for specimen in self.state.specimens}
             known: dict[object, list[tuple[str, Path]]] = {}  # beginning of a file -> specimens with such a file
-            added: list[tuple[str, str | None]] = []
-            for specimen in state.specimens:
-                for place in filter(None, (specimen.file, specimen.original)):
-                    other = self.folder / place
+            for specimen in self.state.specimens:
+                for other in (self.folder / place for place in (specimen.file, specimen.original) if place):
                     with suppress(OSError):  # a scan that was moved is no duplicate
                         known.setdefault(_beginning_of(other), []).append((specimen.id, other))
             for file, called in files:
@@ -386,16 +383,14 @@ class Project:
                     same = next((name for name, other in alike if filecmp.cmp(file, other, shallow=False)), None)
                 except OSError as error:
                     raise FileError(f"Cannot read {file}: {error.strerror or error}.") from error
-                if same is not None:
-                    added.append((same, same))
-                    continue
-                name = _free_name(_stem(called), taken)
-                inside = file.is_relative_to(self.folder)
-                place = file.relative_to(self.folder).as_posix() if inside else str(file)
-                specimens.append(Specimen(id=name, file=place, role=role))
-                taken.add(name.casefold())
-                alike.append((name, file))
-                added.append((name, None))
+                name = same or _free_name(_stem(called), taken)
+                added.append((name, same))
+                if same is None:
+                    is_inside = file.is_relative_to(self.folder)
+                    place = file.relative_to(self.folder).as_posix() if is_inside else str(file)
+                    specimens.append(Specimen(id=name, file=place, role=role))
+                    taken.add(name.casefold())
+                    alike.append((name, file))
             if specimens:
                 self.edit(
                     None,
@@ -863,8 +858,10 @@ def _set_views(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
     for view in views:
         view_rotation(view)
         if not view.name.strip() or len(view.name) > _LONGEST_NAME or names.count(view.name) > 1:
-            shown, most = view.name[:_LONGEST_NAME], f"{_LONGEST_NAME} characters"
-            raise InputError(f"A view cannot be called {shown!r}; give it a name of at most {most} that no other has.")
+            raise InputError(
+                f"A view cannot be called {view.name[:_LONGEST_NAME]!r}; give it a name of at most {_LONGEST_NAME} "
+                "characters that no other has."
+            )
     return "change the named views", replace(state, views={**state.views, on: views})
 
 
@@ -1034,9 +1031,8 @@ def scan_key(scan: Path, folder: Path) -> str:
     Scans in the project's `folder`, which may be moved, are identified by their path in it, others by their complete
     path: those of an archive can have the same name, size and time in different folders.
     """
-    place, inside = str(scan), f"{folder}{os.sep}"  # paths of pathlib would take most of the time of a state
-    if place.startswith(inside):
-        place = place.removeprefix(inside).replace(os.sep, "/")
+    # Methods of pathlib would take most of the time of a state.
+    place = scan.as_posix().removeprefix(f"{folder.as_posix()}/")
     try:
         stat = scan.stat()
         text = f"{place}|{stat.st_size}|{stat.st_mtime_ns}"

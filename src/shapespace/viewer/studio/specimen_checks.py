@@ -20,7 +20,7 @@ from shapespace.batch.workers import context, end_after
 from shapespace.correspondence.odd_scans import ScanMeasures, side_sample
 from shapespace.errors import FileError, InputError, ShapespaceError
 from shapespace.geometry.doctor import examine_and_repair
-from shapespace.geometry.mirror_plane import mirror_image
+from shapespace.geometry.mirror_plane import FLIP, mirror_image
 from shapespace.geometry.normals import boundary_edges, drawable
 from shapespace.io.files import sha256_of_file, write_bytes, write_text
 from shapespace.io.meshes.mesh_io import read_mesh
@@ -80,13 +80,11 @@ class SpecimenChecks:
         """Return the path of the picture of a scan, which exists once it was checked and is usable."""
         return self._folder / f"{scan_key(scan, self._folder.parent)}.webp"
 
-    def sample(self, scan: Path) -> FloatArray | None:
-        """Return the sample of a scan for its side, (P, 6), see `side_sample`; None if the check made none."""
-        try:
-            values = np.fromfile(self.picture(scan).with_suffix(_SAMPLE), dtype=np.float32)
-        except OSError:
-            return None
-        return values.reshape(-1, 6).astype(np.float64)
+    def sample(self, scan: Path, *, mirrored: bool) -> FloatArray | None:
+        """Return the sample of a scan or of its mirror image, (P, 6), see `side_sample`; None if there is none."""
+        file = self.picture(scan).with_suffix(_SAMPLE)
+        factors = np.tile(FLIP, 2) if mirrored else np.ones(6)
+        return np.fromfile(file, dtype=np.float32).reshape(-1, 6) * factors if file.is_file() else None
 
     def surface(self, scan: Path, *, mirrored: bool) -> Future[bytes]:
         """Return the packed surface of a scan for a view, as it is in its file or reflected at x = 0.
