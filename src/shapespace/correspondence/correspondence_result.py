@@ -238,7 +238,7 @@ def unit_ratios(scales: Sequence[float]) -> tuple[FloatArray, FloatArray]:
     """
     logs = np.log(np.asarray(scales, dtype=np.float64))
     reach, ordered = 0.5 * np.log(LEAST_RATIO), np.asarray(np.sort(logs), dtype=np.float64)
-    near = np.searchsorted(ordered, logs + reach) - np.searchsorted(ordered, logs - reach, side="right")
+    near = ordered.searchsorted(logs + reach) - ordered.searchsorted(logs - reach, side="right")
     # If two units are equally frequent, the smaller unit counts as usual.
     most = logs[np.lexsort((logs, near))[-1]]
     relative = logs - np.median(logs[np.abs(logs - most) < reach])

@@ -235,8 +235,9 @@ def find_mirrored_scans(samples: Sequence[FloatArray]) -> list[int]:
             for anchor in anchors
         ]
     )
-    first, second = np.sign(evidence[0]), np.sign(evidence[1])
-    second = np.where(np.arange(count) == anchors[1], first, second * first[anchors[1]])
+    first: FloatArray = np.sign(evidence[0])
+    second: FloatArray = np.sign(evidence[1]) * first[anchors[1]]
+    second[anchors[1]] = first[anchors[1]]
     if np.abs(evidence).min() <= ASYMMETRIC or (first != second).any():
         return []
     return np.flatnonzero(first == (1.0 if 2 * (first < 0).sum() > count else -1.0)).tolist()

@@ -26,7 +26,7 @@ from shapespace.io.files import sha256_of_file, write_bytes, write_text
 from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.report.render.scene import decimate, pack
 from shapespace.report.render.thumbnails import mesh_still
-from shapespace.types import FloatArray, Mesh
+from shapespace.types import FloatArray, Mesh, read_only
 from shapespace.viewer.studio.project import scan_key
 
 _FOLDER, _SAMPLE = "checks", ".points"
@@ -83,8 +83,10 @@ class SpecimenChecks:
     def sample(self, scan: Path, *, mirrored: bool) -> FloatArray | None:
         """Return the sample of a scan or of its mirror image, (P, 6), see `side_sample`; None if there is none."""
         file = self.picture(scan).with_suffix(_SAMPLE)
-        factors = np.tile(FLIP, 2) if mirrored else np.ones(6)
-        return np.fromfile(file, dtype=np.float32).reshape(-1, 6) * factors if file.is_file() else None
+        if not file.is_file():
+            return None
+        sample = read_only(np.fromfile(file, dtype=np.float32).reshape(-1, 6))
+        return sample * np.tile(FLIP, 2) if mirrored else sample
 
     def surface(self, scan: Path, *, mirrored: bool) -> Future[bytes]:
         """Return the packed surface of a scan for a view, as it is in its file or reflected at x = 0.
