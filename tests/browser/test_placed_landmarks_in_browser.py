@@ -82,7 +82,7 @@ def test_a_question_about_landmarks_and_a_curve_on_scans(open_tab, tmp_path: Pat
         tab.until("document.querySelector('[data-testid=checks]').innerText.includes('bone_005 1 of 11')")
         tab.shot("question-form")
         assert barriers(tab) == []
-        tab.page.get_by_test_id("option--missing-landmarks").select_option("estimate-by-spline")
+        tab.page.get_by_test_id("optionmissing-landmarks").select_option("estimate-by-spline")
         tab.until("document.querySelector('[data-testid=checks]').innerText.includes('Included specimens: 6')")
         user.click("run-compare")
         user.has_run(1)

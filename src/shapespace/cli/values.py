@@ -7,8 +7,7 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-from shapespace.io.tables.table_io import DECIMAL_COMMA
-
+_DECIMAL_COMMA = re.compile(r"([+-]?[0-9]*),([0-9]+(?:[eE][+-]?[0-9]+)?)")
 _THOUSANDS = re.compile(r"[+-]?[1-9][0-9]{0,2},[0-9]{3}")
 _LARGEST = 2**63
 """Bound of integers: JSON, in which all settings are written, has no larger ones."""
@@ -51,7 +50,7 @@ def number(text: str) -> float:
 
 def _decimal(text: str) -> float:
     """Return a number with a decimal point or comma; 1,000 is rejected, as it may be a thousand."""
-    return float(text if _THOUSANDS.fullmatch(text) or not DECIMAL_COMMA.fullmatch(text) else text.replace(",", "."))
+    return float(text if _THOUSANDS.fullmatch(text) else _DECIMAL_COMMA.sub(r"\1.\2", text))
 
 
 def probability(text: str) -> float:

@@ -21,7 +21,7 @@
   Studio.titleOf = titleOf;
   Studio.fileAddress = (path) => `/files/${path.split("/").map(encodeURIComponent).join("/")}`;
 
-  const PLACED = "0", MISSING = "--missing-landmarks"; // landmarks on scans as the data of a question, and its option for them
+  const PLACED = "0", MISSING = "missing-landmarks"; // landmarks on scans as the data of a question, and its option for them
   /** Whether a question can be about the landmarks on scans. */
   const hasPlaced = (kind) => Boolean(Studio.forms[kind]?.options.some((option) => option.flag === MISSING)) && Studio.state.project.specimens.some((one) => one.included && one.set === "training" && Object.keys(one.points).length > 0);
 

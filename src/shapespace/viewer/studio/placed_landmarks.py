@@ -15,8 +15,8 @@ from shapespace.viewer.studio.project import Point, Project, ScanCurve, Specimen
 
 PLACED = 0
 """Number that stands for the landmarks on scans where jobs are given whose shapes a question is about."""
-MISSING_LANDMARKS = "--missing-landmarks"
-"""Option of questions about the landmarks on scans, with one of `MISSING_CHOICES`."""
+MISSING_LANDMARKS = "missing-landmarks"
+"""Option of questions about the landmarks on scans, with one of `MISSING_CHOICES`; no command has it."""
 EXCLUDE_LANDMARKS = "exclude-landmarks"
 _ESTIMATES: Mapping[str, str] = {"estimate-by-spline": "tps", "estimate-by-regression": "regression"}
 MISSING_CHOICES = ("exclude-specimens", EXCLUDE_LANDMARKS, *_ESTIMATES)
