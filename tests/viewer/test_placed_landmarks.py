@@ -274,9 +274,14 @@ def test_the_points_of_a_curve_are_spaced_evenly_when_their_number_is_set(tmp_pa
     for k in range(4):
         own = {name: at for name, at in ends.items() if k or name == "ridge_1"}
         edit(made, what="points", id=f"s{k:02}", points=own)
+    with pytest.raises(InputError, match="Only some points of the curve ridge are placed on s00"):
+        edit(made, what="curve", name="ridge", points=5, closed=False)
+    edit(made, what="points", id="s00", points={"ridge_1": None})
     edit(made, what="curve", name="ridge", points=5, closed=False)
     found = checks(made, FORMS, "morphospace", {}, shapes_of(made, [], "morphospace", None))
-    assert any("s00 5 of 13" in one["text"] for one in found)  # one point is no curve
+    assert any("s00 5 of 13" in one["text"] for one in found)
+    with pytest.raises(InputError, match="There is a landmark called"):
+        edit(made, what="curve", name=NAMES[0], points=5, closed=False)
     files = order(made, [], FORMS, "morphospace", {}, None, 1).files
     rows = [row.split(",") for row in files["inputs/0001-landmarks/landmarks.csv"].split("\n")[1:-1]]
     spaced = [list(map(float, row[2:])) for row in rows if row[0] == "s02" and row[1].startswith("ridge")]
@@ -379,9 +384,10 @@ def test_an_answer_from_landmarks_is_computed_again_by_the_history(tmp_path: Pat
     environment = {**os.environ, "PATH": f"{commands}:{os.environ['PATH']}"}
     subprocess.run(["sh", str(folder / "history.sh"), str(again)], check=True, env=environment)
     assert (again / "compare-1/terms.csv").read_text() == (folder / "compare-1/terms.csv").read_text()
+    assert (again / "inputs/0001-landmarks/aligned/aligned.csv").is_file()
 
 
-def test_the_history_names_all_files_of_landmarks_in_the_project(tmp_path: Path) -> None:
+def test_the_history_reads_landmarks_in_the_project_and_writes_into_its_folder(tmp_path: Path) -> None:
     made = marked_project(tmp_path / "p", 4)
     edit(made, what="curve", name="ridge", points=3, closed=False)
     for k in range(4):
@@ -390,4 +396,6 @@ def test_the_history_names_all_files_of_landmarks_in_the_project(tmp_path: Path)
     done.run("asymmetry", {"--subject": "person"})
     lines = [line.split() for line in history(done.jobs).splitlines()[-2:]]
     paths = [word for line in lines for word in line if "inputs/" in word]
-    assert len(paths) == 6 and all(word.startswith('"$PROJECT"/inputs/0001') for word in paths)
+    aligned = [word for word in paths if word == "inputs/0001-landmarks/aligned"]  # in the new folder
+    assert len(paths) == 6 and len(aligned) == 2
+    assert all(word.startswith('"$PROJECT"/inputs/0001') for word in paths if word not in aligned)

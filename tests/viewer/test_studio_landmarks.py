@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from test_studio_project import Done, edit, project, tetrahedron
-from test_studio_server import own_home, state, studio, upload
+from test_studio_server import own_home, state, studio, until, upload
 
 from shapespace.cli import main, parser
 from shapespace.cli.command_table import summaries_and_options
@@ -293,3 +293,22 @@ def test_dropped_files_of_landmarks_and_edits_come_over_http(tmp_path: Path) -> 
         assert client.post("/api/edit", json={**place, "before": {"nose": [1, 2, 3]}}).status_code == 200
         assert client.post("/api/edit", json={**place, "before": {"nose": [1, 2, 3]}}).status_code == 409
         assert ".fcsv" in client.get("/api/project").json()["landmark_formats"]
+
+
+def test_landmarks_that_are_not_on_their_scan_are_named_on_import_and_before_a_question(tmp_path: Path) -> None:
+    with studio(tmp_path / "p") as client:
+        upload(client, tmp_path, 2)
+        until(client, lambda now: all(one["state"] == "ready" for one in now["specimens"]))
+        corners = {name: read_mesh(tmp_path / f"{name}.ply").vertices[:4] for name in ("s0", "s1")}
+        for scale, named in ((1.0, set()), (10.0, {"s0"})):  # as in cm among mm
+            rows = [
+                f"{name},m{k},{','.join(map(str, corner * (scale if name == 's0' else 1.0)))}"
+                for name, points in corners.items()
+                for k, corner in enumerate(points)
+            ]
+            text = "\n".join(["specimen,landmark,x,y,z", *rows]).encode()
+            sent = client.post("/api/table", params={"name": "marks.csv", "kind": "landmarks"}, content=text)
+            assert {note.split(":")[0] for note in sent.json()["notes"]} == named, sent.text
+            asked = {"kind": "morphospace", "options": {}, "on": 0}
+            found = [one["text"] for one in client.post("/api/checks", json=asked).json()]
+            assert {text.split(":")[0] for text in found if "not on its scan" in text} == named

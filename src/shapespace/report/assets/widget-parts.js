@@ -34,9 +34,9 @@
     const output = make("output", { for: id });
     const range = make("input", { type: "range", id, min, max, step, value, "aria-label": name, "data-testid": testid });
     const share = (at) => `${((100 * (at - range.min)) / (range.max - range.min || 1)).toFixed(2)}%`;
-    const update = () => {
-      const now = Number(range.value);
-      output.textContent = show(now);
+    const update = (to = Number(range.value)) => {
+      const now = Number(range.value); // in steps, from min to max
+      output.textContent = show(to);
       range.setAttribute("aria-valuetext", output.textContent);
       range.style.setProperty("--from", share(Math.min(now, origin)));
       range.style.setProperty("--to", share(Math.max(now, origin)));
@@ -54,7 +54,7 @@
       get: () => Number(range.value),
       put: (to) => {
         range.value = to;
-        update();
+        update(to);
       },
     };
   }

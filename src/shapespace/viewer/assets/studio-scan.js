@@ -89,10 +89,11 @@
     const [points, setPoints] = useState("");
     const add = async (event) => {
       event.preventDefault();
-      const done = points ? await setCurve(name, points, false) : await setNames([...Studio.state.project.point_names, name]);
-      if (done) { onadd(points ? `${name.trim()}_1` : name.trim()); setName(""); setPoints(""); }
+      const curve = Studio.state.project.curves[name.trim()]; // one that exists is chosen, not spaced again
+      const done = curve || (points ? await setCurve(name, points, false) : await setNames([...Studio.state.project.point_names, name]));
+      if (done) { onadd(curve || points ? `${name.trim()}_1` : name.trim()); setName(""); setPoints(""); }
     };
-    return html`<form onsubmit=${add}><div class="row"><input required size="14" aria-label=${M.name} placeholder=${M.name} data-testid="mark-name" value=${name} oninput=${(event) => setName(event.target.value)} />
+    return html`<form onsubmit=${add}><div class="row"><input required size="20" aria-label=${M.name} placeholder=${M.name} data-testid="mark-name" value=${name} oninput=${(event) => setName(event.target.value)} />
       <button class="small" data-testid="mark-add" disabled=${!name.trim()}>${M.add}</button></div>
       <label class="row hint">${M.pointsOf} <input type="number" min="3" max="500" data-testid="mark-points" value=${points} oninput=${(event) => setPoints(event.target.value)} /></label></form>`;
   }

@@ -30,6 +30,7 @@ from shapespace.io.files import atomic_path
 from shapespace.io.landmarks.configuration_io import CONFIGURATION_ENDINGS
 from shapespace.io.meshes.mesh_io import MESH_ENDINGS, MESH_FILE_ENDINGS
 from shapespace.io.volume_io import VOLUME_ENDINGS
+from shapespace.reprs import first_names
 from shapespace.schemas import read
 from shapespace.types import MM_PER_UNIT
 from shapespace.version import __version__
@@ -60,6 +61,7 @@ from shapespace.viewer.studio.job_commands import (
 )
 from shapespace.viewer.studio.jobs import Job, Jobs, Order, history
 from shapespace.viewer.studio.landmark_import import is_landmark_table, read_points
+from shapespace.viewer.studio.placed_landmarks import PLACED
 from shapespace.viewer.studio.project import (
     PastedBlock,
     Project,
@@ -81,6 +83,7 @@ _EVENT_S = 0.4  # between events
 _MIRRORED = (
     "Probably a mirror image of most others, such as a left one among right ones; mirror it under Specimens if so."
 )
+_BESIDE = 0.1  # of the extent of a scan, from which on a landmark is not on it
 _MOST_LISTED = 2000  # folders and files of a listing
 
 
@@ -178,6 +181,27 @@ class OpenProject:
             known = {name: sample for name, sample in samples.items() if sample is not None}
             self._mirrored = key, [list(known)[k] for k in find_mirrored_scans(list(known.values()))]
         return self._mirrored[1]
+
+    def landmarks_off_scans(self) -> dict[str, str]:
+        """Return a sentence on each specimen with landmarks outside of the box around its scan, by its id."""
+        found, facts = dict[str, str](), self._checked()
+        for specimen in self.project.state.specimens:
+            box = facts.get(specimen.id, {}).get("box")
+            if box is None or not specimen.points:
+                continue
+            low, high = np.array(box)
+            beside = np.abs(np.array([*specimen.points.values()]) - (low + high) / 2) - (high - low) / 2
+            off = [
+                name
+                for name, far in zip(specimen.points, beside, strict=True)
+                if far.max() > _BESIDE * (high - low).max()
+            ]
+            if off:
+                names = first_names(off)
+                found[specimen.id] = (
+                    f"{specimen.id}: not on its scan: {names}; check the unit and axes of the landmarks."
+                )
+        return found
 
     def scan_contents(self) -> dict[str, str]:
         """Return the hash of the scan of each specimen by its id; scans that were not checked yet are read for it."""
@@ -513,6 +537,8 @@ class Studio:
         names, points, curves, notes = await run_in_threadpool(read_points, content, name, project.state)
         await run_in_threadpool(project.edit, None, with_points(names, points, curves), together="import landmarks")
         self._changed()
+        off = await run_in_threadpool(self._project.landmarks_off_scans)
+        notes += [text for name, text in off.items() if name in points]
         return json_response({"matched": len(points), "landmarks": len(names), "notes": notes})
 
     async def _match_block(self, request: Request) -> Response:
@@ -554,6 +580,8 @@ class Studio:
         if kind == "correspond":
             odd = [f"{name}: {odd.text}" for name, odd in opened.odd_scans().items()]
             odd += [f"{name}: {_MIRRORED}" for name in await run_in_threadpool(opened.mirrored_scans)]
+        elif shapes is not None and shapes.number == PLACED:
+            odd = [*(await run_in_threadpool(opened.landmarks_off_scans)).values()]
         found = await run_in_threadpool(checks, opened.project, self._forms, kind, given, shapes, odd)
         return json_response([{**finding, "text": self._labels.sentence(finding["text"])} for finding in found])
 

@@ -401,7 +401,7 @@ def checks(
         kind: kind of the job.
         options: flag -> value, as sent by the page.
         shapes: job whose shapes a question is about; None for other kinds.
-        odd: sentences on specimens that differ from the others.
+        odd: sentences on specimens that differ from the others, or on landmarks that are not on their scans.
     """
     listed = chosen = _specimens_of(project, shapes, options)
     columns = _used_columns(project.state.columns, options)
@@ -411,9 +411,10 @@ def checks(
     if drop_missing:
         chosen = [specimen for specimen in chosen if all(specimen.cells.get(column) for column in columns)]
     found = [("ok" if len(chosen) >= 2 else "problem", f"Included specimens: {len(chosen)}.")]
+    rest = [f"{len(odd) - _MOST_ODD} more specimens like these."] if len(odd) > _MOST_ODD else []
+    found += [("warning", text) for text in (*odd[:_MOST_ODD], *rest)]
     if kind == "correspond":
-        rest = [f"{len(odd) - _MOST_ODD} more specimens differ from the others."] if len(odd) > _MOST_ODD else []
-        return _as_findings([*found, *(("warning", text) for text in (*odd[:_MOST_ODD], *rest))])
+        return _as_findings(found)
     if shapes is not None and shapes.kind in CORRESPONDENCES:
         there = _surface_files(project, shapes, chosen)
         lacking = [specimen.id for specimen in chosen if specimen.id not in there]
@@ -520,6 +521,7 @@ def _reason_of_rejection(
         notes = read(AlignRecord, read_json(record, ""), str(record), "").notes if record.is_file() else ()
         texts = [
             text.replace(str(folder / next(iter(made.files))), "The table")
+            .replace(f"{_INPUTS}/0000-landmarks/pairs.csv", "The pairs of landmarks")
             .replace(f"{folder}{os.sep}", "")
             .replace(f"{project.folder}{os.sep}", "")
             for text in (reason, *notes[:_MOST_ODD])

@@ -164,7 +164,9 @@ class State(Struct, frozen=True, kw_only=True):
     def mirrored_pairs(self) -> tuple[tuple[str, str], ...]:
         """The pairs of landmarks that mirror each other: those that the user chose, or that the names show."""
         found = pairs_by_name(self.point_names) if self.pairs is None else self.pairs
-        return tuple(pair for pair in found if {*pair} <= {*self.point_names})
+        counts = {point: curve.points for name, curve in self.curves.items() for point in curve.names(name)}
+        named = (pair for pair in found if {*pair} <= {*self.point_names})
+        return tuple((one, other) for one, other in named if counts.get(one) == counts.get(other))
 
     def chosen(self, role: Role) -> tuple[Specimen, ...]:
         """Return the included specimens of a role by name: the order in which they were added differs between drops."""
@@ -914,11 +916,18 @@ def _set_curve(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
     name, curve = str(request["name"]).strip(), ScanCurve(int(request["points"]), bool(request["closed"]))
     if not name or not LEAST_LANDMARKS <= curve.points <= MOST_POINTS:
         raise InputError(f"A curve needs a name, and {LEAST_LANDMARKS} to {MOST_POINTS} points.")
+    if name in state.point_names:
+        raise InputError(f"There is a landmark called {name}; give the curve another name.")
     old, new = state.curves.get(name, curve).names(name), curve.names(name)
+    partly = [one.id for one in state.specimens if 0 < len({*old} & {*one.points}) < len(old)]
+    if partly:
+        raise InputError(
+            f"Only some points of the curve {name} are placed on {partly[0]}; place all, or remove them, and try again."
+        )
 
     def with_spaced(specimen: Specimen) -> Specimen:
         placed = [specimen.points[point] for point in old if point in specimen.points]
-        spaced = curve.spaced(placed) if len(placed) > 1 + curve.closed else []
+        spaced = curve.spaced(placed) if placed else []
         others = {point: place for point, place in specimen.points.items() if point not in old}
         return replace(specimen, points=others | dict(zip(new, spaced, strict=False)))
 
@@ -927,6 +936,7 @@ def _set_curve(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
         point_names=tuple(point for point in state.point_names if point not in old),
         specimens=tuple(map(with_spaced, state.specimens)),
         curves={**state.curves, name: curve},
+        pairs=state.pairs and tuple(pair for pair in state.pairs if new == old or not {*pair} & {*old}),
     )
     return f"set the points of the curve {name}", with_points(new, {})(edited)[1]
 

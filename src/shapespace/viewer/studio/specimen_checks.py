@@ -69,7 +69,7 @@ class SpecimenChecks:
             self._ask(key, scan)
             return None
         if (
-            facts.get("state") == "ready" and not {"profile", "content", "sampled"} <= facts.keys()
+            facts.get("state") == "ready" and not {"profile", "content", "box"} <= facts.keys()
         ):  # from an earlier version
             self._ask(key, scan)
             return None
@@ -201,7 +201,8 @@ def check_scan(scan: Path, stem: Path) -> dict[str, Any]:
         }  # fmt: skip
         if repaired is not None:
             measures = ScanMeasures.of(repaired)
-            facts |= {"size": measures.size, "profile": measures.profile.tolist(), "sampled": True}
+            box = [repaired.vertices.min(axis=0).tolist(), repaired.vertices.max(axis=0).tolist()]
+            facts |= {"size": measures.size, "profile": measures.profile.tolist(), "box": box}
             if repaired.faces is not None:
                 write_bytes(stem.with_suffix(_SAMPLE), side_sample(repaired).astype(np.float32).tobytes())
             picture, _ = mesh_still(repaired)
