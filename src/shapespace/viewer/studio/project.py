@@ -166,7 +166,7 @@ class State(Struct, frozen=True, kw_only=True):
         found = pairs_by_name(self.point_names) if self.pairs is None else self.pairs
         counts = {point: curve.points for name, curve in self.curves.items() for point in curve.names(name)}
         named = (pair for pair in found if {*pair} <= {*self.point_names})
-        return tuple((one, other) for one, other in named if counts.get(one) == counts.get(other))
+        return tuple(pair for pair in named if counts.get(pair[0]) == counts.get(pair[1]))
 
     def chosen(self, role: Role) -> tuple[Specimen, ...]:
         """Return the included specimens of a role by name: the order in which they were added differs between drops."""
@@ -919,7 +919,7 @@ def _set_curve(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
     if name in state.point_names:
         raise InputError(f"There is a landmark called {name}; give the curve another name.")
     old, new = state.curves.get(name, curve).names(name), curve.names(name)
-    partly = [one.id for one in state.specimens if 0 < len({*old} & {*one.points}) < len(old)]
+    partly = [specimen.id for specimen in state.specimens if 0 < len({*old} & {*specimen.points}) < len(old)]
     if partly:
         raise InputError(
             f"Only some points of the curve {name} are placed on {partly[0]}; place all, or remove them, and try again."
