@@ -35,11 +35,12 @@ FLAGS += ["--disable-quic", "--no-first-run", "--disable-background-networking",
 # Whole: from the event to pixels that were read back. Drag, below, ends where the picture is handed to the browser.
 SCRIPT = """async ([repeat, map]) => {
   const root = document.querySelector("[data-testid=pane]").shadowRoot;
-  const box = root.getElementById("map");
+  const find = (name) => root.querySelector(`[data-testid=${name}]`);
+  const box = find("map");
   if (box.checked !== map) box.click();
   const view = window.shapespaceStage.a;
   const move = (k, value) => {
-    const slider = root.getElementById(`mode-${k + 1}`);
+    const slider = find(`mode-${k + 1}`);
     slider.value = value;
     slider.dispatchEvent(new Event("input", { bubbles: true }));
   };
@@ -59,21 +60,35 @@ SCRIPT = """async ([repeat, map]) => {
 }"""
 
 
+# ms from the first event of a slider to the picture, as drawn.
+TIMES = """() => {
+  const stage = window.shapespaceStage.a;
+  const sliders = document.querySelector("[data-testid=pane]").shadowRoot.querySelector("[data-testid=sliders]");
+  let began = 0;
+  window.times = [];
+  sliders.addEventListener("input", () => { began = began || performance.now(); }, true);
+  stage.on("draw", () => {
+    if (began) window.times.push(performance.now() - began);
+    began = 0;
+  });
+}"""
+
+
 def drag(page: Any, repeat: int) -> dict[str, Any]:
     """Drag the slider of the second mode by the mouse, and return ms from each event to its picture."""
-    box = page.locator("#mode-2").bounding_box()
+    box = page.get_by_test_id("mode-2").bounding_box()
     y = box["y"] + box["height"] / 2
     page.mouse.move(box["x"] + box["width"] / 2, y)
     page.mouse.down()
     page.wait_for_timeout(500)
-    before = page.evaluate("window.shapespaceTimes.length = 0; window.shapespaceStage.a.frames")
+    before = page.evaluate("window.times.length = 0; window.shapespaceStage.a.frames")
     began = time.perf_counter()
     for step in range(repeat):
         page.mouse.move(box["x"] + box["width"] * (0.5 + 0.4 * np.sin(step / 8)), y)
     seconds = time.perf_counter() - began
     drawn = page.evaluate("window.shapespaceStage.a.frames") - before
     page.mouse.up()
-    return {"drag": page.evaluate("window.shapespaceTimes.slice()"), "pictures a second": drawn / seconds}
+    return {"drag": page.evaluate("window.times.slice()"), "pictures a second": drawn / seconds}
 
 
 def model_file(folder: Path) -> Path:
@@ -113,6 +128,7 @@ def measure(repeat: int) -> dict[str, object]:
                 page.wait_for_selector("[data-testid=pane][data-ready]")
                 opened = time.perf_counter() - start
                 page.wait_for_timeout(1500)
+                page.evaluate(TIMES)
                 asked: list[str] = []
                 page.on("request", lambda request: asked.append(request.url))
                 plain = page.evaluate(SCRIPT, [repeat, False]) | drag(page, repeat)

@@ -116,3 +116,13 @@ def raw_scan(
     points = points + noise_mm * np.random.default_rng(seed).standard_normal(points.shape)
     truth = blob(sphere(model_vertices)[0], z)
     return Raw(Mesh(T.apply(points), faces.astype(np.int32), name="raw.ply"), T.apply(truth), T)
+
+
+def twisted(mesh: Mesh) -> Mesh:
+    """Return a mesh that is flattened, and twisted about its longest axis to the right, and so has a side."""
+    centred = mesh.vertices - mesh.vertices.mean(axis=0)
+    axes = np.linalg.eigh(centred.T @ centred)[1]
+    x, y, z = ((centred @ axes) * [0.4 * np.linalg.det(axes), 0.8, 1.5]).T
+    angle = 1.5 * z / np.ptp(z)
+    along = np.cos(angle) * x - np.sin(angle) * y
+    return mesh.with_vertices(np.stack([along, np.sin(angle) * x + np.cos(angle) * y, z], axis=1))

@@ -132,8 +132,20 @@ def test_scans_are_groomed_by_clicks_and_the_originals_come_back(open_tab, tmp_p
         assert crop.contains(after.vertices).all()
         # The centre is on the surface of the file, which the view shows reflected.
         assert np.linalg.norm(before.vertices - crop.numbers[:3], axis=1).min() < 5.0
-        # Planes that face the viewer.
+        # The same crop by the keyboard, and a plane.
+        user.click("crop-sphere")
+        for axis, value in zip("xyz", crop.numbers[:3], strict=True):
+            tab.page.get_by_test_id(f"crop-{axis}").fill(str(value))
+        tab.page.get_by_test_id("crop-radius").fill("0.2")
+        size = np.ptp(after.vertices, axis=0).max()
+        for steps in (0, 100):
+            for _ in range(steps):
+                tab.page.get_by_test_id("crop-x").press("ArrowUp")
+            centre = np.add(crop.numbers[:3], [steps * size / 500, 0, 0])
+            share = (np.linalg.norm(after.vertices - centre, axis=1) <= 0.2 * size).mean()
+            assert abs(int(tab.page.get_by_test_id("crop-share").inner_text().split()[0]) - 100 * share) < 1
         user.click("crop-plane")
+        assert tab.page.get_by_test_id("crop-share").inner_text().startswith(("4", "5"))
         tab.page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
         tab.page.get_by_test_id("crop-keep").select_option("front")
         tab.page.wait_for_timeout(600)

@@ -154,11 +154,12 @@ def test_landmarks_are_placed_by_clicks_drags_keys_and_files(open_tab, tmp_path:
         tab.page.get_by_test_id("choose-files-input").set_input_files(
             [tmp_path / "bone_002.mrk.json", tmp_path / "zoe.fcsv", tmp_path / "bone_001.tps"]
         )
-        tab.until("document.querySelectorAll('[data-testid=upload-notes] li').length === 3")
-        notes = tab.page.get_by_test_id("upload-notes").locator("li").all_inner_texts()
+        tab.until("document.querySelectorAll('[data-testid=upload-notes] li').length === 4")
+        notes = tab.page.get_by_test_id("upload-notes").locator("li").all_text_contents()
         assert any("contains no specimen of zoe.fcsv" in note for note in notes)
         assert any("bone_001.tps" in note for note in notes)
         assert "bone_002.mrk.json: 3 landmarks of 1 specimen read." in notes
+        assert any("bone_002: not on its scan" in note for note in notes)  # they are of another scan
         for name, point in stored(project, "bone_000").items():
             assert np.array_equal(stored(project, "bone_002")[name], point)
         tab.shot("landmarks-cards")

@@ -295,17 +295,17 @@ def test_the_widgets_work_by_their_controls(page_of, staged: StagedFit) -> None:
         page.wait_for_function(f"W.{name} && W.{name}.view.frames > 0")
 
     def changes(name: str, act) -> None:
-        before = page.locator(f"#{name} .ss-plate").screenshot()
+        before = page.locator(f"#{name} .ss-panes").screenshot()
         act()
         page.wait_for_timeout(250)
-        assert page.locator(f"#{name} .ss-plate").screenshot() != before
+        assert page.locator(f"#{name} .ss-panes").screenshot() != before
 
-    first = page.get_by_label("Mode 1", exact=False).first
+    first = page.get_by_role("slider", name="Mode 1,")
     changes("m", lambda: first.fill("2.5"))
-    assert "+2.5 sd" in page.inner_text("#m")
+    assert "+2.50" in page.inner_text("#m")
     changes("m", lambda: page.get_by_label("Colour by distance from the mean").check())
-    changes("m", lambda: page.get_by_role("button", name="Random").click())
-    changes("m", lambda: page.get_by_role("button", name="Reset").click())
+    changes("m", lambda: page.get_by_role("button", name="Random shape").click())
+    changes("m", lambda: page.get_by_role("button", name="Mean shape").click())
     assert page.evaluate("W.m.z.every((v) => v === 0)")
     page.get_by_role("button", name="Animate").click()
     page.wait_for_function("Math.abs(W.m.z[0]) > 0.5")
@@ -313,14 +313,20 @@ def test_the_widgets_work_by_their_controls(page_of, staged: StagedFit) -> None:
 
     changes("f", lambda: page.get_by_label("Before").check(force=True))
     changes("f", lambda: page.get_by_label("Phase 2").check(force=True))
-    changes("f", lambda: page.get_by_label("Colour").last.select_option("none"))
-    changes("f", lambda: page.get_by_label("Colour").last.select_option("model"))
+    changes("f", lambda: page.get_by_label("Plain").check(force=True))
+    changes("f", lambda: page.get_by_label("Model to scan").check(force=True))
+    changes("f", lambda: page.get_by_label("Side by side").check(force=True))
+    assert page.locator("#f .ss-plate").count() == 2
+    page.get_by_label("Overlaid").check(force=True)
     page.get_by_label("Mark what lies beyond a threshold").check()
-    changes("f", lambda: page.get_by_label("Threshold", exact=True).fill("0.2"))
+    threshold = page.get_by_label("Threshold", exact=True)
+    assert float(threshold.get_attribute("max")) == 2 * staged.scale_mm
+    limit = 0.1 * staged.scale_mm
+    changes("f", lambda: threshold.fill(f"{limit:g}"))
     shown = staged.model_to_scan_mm["final"]
     share = float(page.inner_text("#f .ss-said").split("mm.")[1].split("%")[0])
-    assert abs(share - 100 * (np.abs(shown) > 0.2).mean()) < 0.6
-    changes("f", lambda: page.get_by_label("Colour").last.select_option("regions"))
+    assert abs(share - 100 * (np.abs(shown) > limit).mean()) < 0.6
+    changes("f", lambda: page.get_by_label("Regions").check(force=True))
     changes("f", lambda: page.get_by_label("Show model").uncheck())
 
     changes("s", lambda: page.get_by_label("Point", exact=True).select_option("3"))
@@ -375,12 +381,12 @@ def test_a_fit_says_what_its_colours_mean(page_of, staged: StagedFit, kind: str)
         assert "Distance to the points (mm)" in told and "\u2212" not in told
     else:
         assert "Scan inside (\u2212) or outside (+) of the model (mm)" in told and f"\u2264 \u2212{end}" in told
-    tab.page.get_by_label("Colour").last.select_option("scan")
+    tab.page.get_by_label("Scan to model").check(force=True)
     assert "not shown by the scan" not in bar.inner_text()
     tab.page.get_by_label("Mark what lies beyond a threshold").check()
     assert "beyond " in bar.inner_text()
-    tab.page.get_by_label("Colour").last.select_option("none")
-    assert "nearer one is shown" in tab.page.inner_text("#f .ss-said")
+    tab.page.get_by_label("Plain").check(force=True)
+    assert "nearer one is shown" in tab.page.inner_text("#f .ss-legend")
     assert tab.complaints == []
 
 
@@ -392,7 +398,7 @@ def test_the_colour_of_the_scan_is_shown_where_there_is_one(page_of, staged: Sta
     script = 'Shapespace.widgets.fit(document.getElementById("f"), "f-data").then((w) => (window.w = w));'
     tab = page_of(PLACES, script, **{"f-data": scene.pack_fit(staged)})
     tab.page.wait_for_function("window.w")
-    assert tab.page.locator("#f option[value=colour]").count() == 0
+    assert tab.page.locator("#f [data-value=colour]").count() == 0
     final = staged.surfaces["final"]
     green = np.tile(np.array([0, 255, 0], np.uint8), (len(final.vertices), 1))
     given = replace(
@@ -402,12 +408,12 @@ def test_the_colour_of_the_scan_is_shown_where_there_is_one(page_of, staged: Sta
     )
     tab = page_of(PLACES, script, **{"f-data": scene.pack_fit(given)})
     tab.page.wait_for_function("window.w")
-    tab.page.get_by_label("Colour").last.select_option("colour")
+    tab.page.get_by_label("Colour of the scan").check(force=True)
     tab.page.wait_for_timeout(300)
     shown = Image.open(io.BytesIO(tab.page.locator("#f .ss-plate").screenshot())).convert("RGB")
     red, light, blue = np.moveaxis(np.asarray(shown).astype(int), 2, 0)
     assert ((light > red + 80) & (light > blue + 80)).mean() > 0.1
-    assert "does not follow" in tab.page.inner_text("#f .ss-said")
+    assert "does not follow" in tab.page.inner_text("#f .ss-legend")
     assert tab.complaints == []
 
 
@@ -427,8 +433,8 @@ def test_without_webgl_the_page_says_so_and_goes_on(page_of, staged: StagedFit) 
         tab.page.locator(f"#{name}").scroll_into_view_if_needed()
         tab.page.wait_for_function(f"W.{name}")
         assert "WebGL is switched off or missing" in tab.page.inner_text(f"#{name}")
-    tab.page.get_by_label("Mode 1", exact=False).first.fill("1")
-    tab.page.get_by_label("Colour").last.select_option("model")
+    tab.page.get_by_role("slider", name="Mode 1,").fill("1")
+    tab.page.get_by_label("Model to scan").check(force=True)
     assert "Mean distance" in tab.page.inner_text("#f")
     assert tab.complaints == []
 

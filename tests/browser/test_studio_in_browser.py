@@ -17,6 +17,7 @@ from pictures import change, drawn_share, same_as_kept
 
 from shapespace.cli import main
 from shapespace.model.shape_model import ShapeModel
+from shapespace.viewer.studio.project import Project, with_cells
 
 WINDOW = {"width": 1440, "height": 900}
 MOST_CLICKS = 15
@@ -128,6 +129,39 @@ def exclude_in_morphospace(tab, user: User, project: Path) -> None:
         tab.page.wait_for_timeout(100)
 
 
+def vertices_apart(tab, view: str, positions: str) -> np.ndarray:
+    """Return the direction in a picture from one vertex of the mean shape to another, of length 1."""
+    points = [f"{view}.project(Array.from({positions}.subarray({3 * k}, {3 * k + 3})))" for k in (0, 150)]
+    first, second = np.array(tab.page.evaluate(f"[{', '.join(points)}]"))[:, :2]
+    return (second - first) / np.linalg.norm(second - first)
+
+
+def name_a_view(tab, user: User) -> np.ndarray:
+    """Turn the surfaces and name their view by the keyboard; return a direction in its picture."""
+    tab.page.get_by_test_id("view-0").locator("canvas").first.focus()
+    for key in ["ArrowUp"] * 5 + ["ArrowRight"] * 3:
+        tab.page.keyboard.press(key)
+    user.click("views-edit")
+    tab.page.get_by_test_id("view-roll").focus()
+    tab.page.keyboard.press("PageUp")
+    tab.page.get_by_test_id("view-name").fill("dorsal")
+    tab.page.keyboard.press("Enter")
+    user.sees("named-view-dorsal")
+    tab.shot("naming")
+    assert barriers(tab) == []
+    tab.page.get_by_test_id("view-rename-dorsal").fill("above")
+    tab.page.keyboard.press("Enter")
+    user.sees("named-view-above")
+    tab.page.keyboard.press("Escape")
+    named = vertices_apart(tab, "window.shapespaceCells[0].view", "window.shapespaceCells[0].positions")
+    tab.page.get_by_test_id("front").click()
+    front = vertices_apart(tab, "window.shapespaceCells[0].view", "window.shapespaceCells[0].positions")
+    user.click("named-view-above")
+    again = vertices_apart(tab, "window.shapespaceCells[0].view", "window.shapespaceCells[0].positions")
+    assert named @ again > 0.9999 > 0.99 > named @ front
+    return named
+
+
 def is_outdated_until_undone(tab, user: User) -> None:
     """Change a class of the table: the answer that used it is marked on its screen and in the list of results."""
     tab.page.get_by_test_id("tab-specimens").click()
@@ -210,12 +244,18 @@ def test_raw_scans_become_a_report_by_clicks_and_history_gives_the_same_numbers(
             same_as_kept("screen-correspondence.png", shot, width=1200)
         if count == 4:
             place_and_drag(tab, project)
+            clicks, named = user.clicks, name_a_view(tab, user)
+            user.clicks = clicks
         user.click("next")
         user.click("run-build")
         user.has_run(2)
         has_drawn(tab)
         tab.shot("model")
         assert barriers(tab) == []
+        if count == 4:  # the view that was named on the surfaces is one of the model
+            tab.page.get_by_test_id("named-view-above").click()
+            mean = "window.shapespaceStage.a._things.get('model').object.geometry.attributes.position.array"
+            assert vertices_apart(tab, "window.shapespaceStage.a", mean) @ named > 0.999
         user.click("next")
         user.click("question-compare")
         user.click("term-group")
@@ -246,6 +286,9 @@ def test_raw_scans_become_a_report_by_clicks_and_history_gives_the_same_numbers(
             seen = open_tab(place, WINDOW, "dark")
             User(seen).sees("row-bone_001")
             assert seen.page.get_by_test_id("choose-files").count() == 0
+            seen.page.get_by_test_id("tab-model").click()
+            assert seen.page.get_by_test_id("views").count() == seen.page.get_by_test_id("named-view-above").count()
+            assert seen.page.get_by_test_id("views-edit").count() == 0
             seen.page.get_by_test_id("tab-questions").click()
             seen.page.get_by_test_id("earlier-3").click()
             User(seen).sees("sentences")
@@ -326,6 +369,41 @@ def test_what_was_dropped_edited_and_excluded_is_there_after_a_restart(open_tab,
     with studio(project, tmp_path) as address:
         tab = open_tab(address, WINDOW)
         tab.until("document.querySelectorAll('[data-testid^=row-]').length === 4")
+
+
+COMPOSE = """(input, key) => {
+  input.dispatchEvent(new KeyboardEvent("keydown", { key, isComposing: true, bubbles: true, cancelable: true }));
+}"""
+
+
+@pytest.mark.parametrize("locale", ["de-DE", pytest.param("ja-JP", marks=pytest.mark.pairs)])
+def test_numbers_and_words_of_other_languages_are_typed_as_there(open_tab, tmp_path: Path, locale: str) -> None:
+    project = Project.open(tmp_path / "p", create=True)
+    for k in range(1, 4):
+        path = project.new_file(f"s{k}.obj")
+        path.write_text(f"v 0 0 0\nv {1500 * k} 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+        project.add(path, "training")
+    project.edit(None, with_cells(("masse", "骨"), {}))
+    with studio(project.folder, tmp_path) as address:
+        tab = open_tab(address, WINDOW, locale=locale)
+        User(tab).sees("cell-s1-masse")
+        assert tab.page.evaluate("(1.5).toLocaleString()") == ("1,5" if locale == "de-DE" else "1.5")
+        cell = tab.page.get_by_test_id("cell-s1-masse")
+        cell.fill("3,5")
+        cell.press("Enter")
+        word = tab.page.get_by_test_id("cell-s1-骨")
+        word.fill("大腿骨")
+        for key in ("Enter", "ArrowDown"):
+            word.evaluate(COMPOSE, key)
+            assert word.evaluate("(input) => input === document.activeElement")
+        word.press("Enter")
+        tab.until("document.querySelector('[data-testid=cell-s1-骨]').dataset.edited === 'false'")
+        tab.until(
+            "document.querySelector('[data-testid=row-s2]')?.innerText.includes('3,000')"
+        )  # numbers as in the texts
+        tab.page.wait_for_timeout(500)
+        assert tab.complaints == []
+    assert Project.open(project.folder).state.specimens[0].cells == {"masse": "3.5", "骨": "大腿骨"}
 
 
 @pytest.mark.parametrize("count", [60, pytest.param(1000, marks=pytest.mark.long)])

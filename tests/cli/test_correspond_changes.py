@@ -208,6 +208,11 @@ def test_landmarks_correct_a_scan_where_others_have_them_too(run: Run, same: Pat
     assert 0 <= record(same, "blob2")["landmark_rms"] < 15
     again = run("correspond", "--update", "-o", same, *QUIET)
     assert again.code == 2 and "give them again with --landmarks" in again.sentence()
+    # A list states the landmarks of its scans, so that it can state that there are none.
+    listed = tmp_path / "list.csv"
+    listed.write_text("id,file\nblob2,scans/blob2.ply\n")
+    assert run("correspond", listed, "--redo", "blob2", "-o", same, *QUIET).code == 0
+    assert not record(same, "blob2")["landmark_distances"]
 
 
 def test_update_computes_mean_and_surfaces_anew_from_all_scans(

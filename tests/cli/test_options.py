@@ -1,5 +1,6 @@
 """Options are those of the classes and functions that take them, and help lists the basic ones first."""
 
+import argparse
 import contextlib
 import dataclasses
 import importlib
@@ -15,6 +16,7 @@ from shapespace import cli
 from shapespace.cli import command_table
 from shapespace.cli.command_table import COMMANDS, CommandSpec
 from shapespace.cli.options import NO_DEFAULT, Option, Source
+from shapespace.cli.values import number
 
 SOURCES = [value for value in vars(command_table).values() if isinstance(value, Source)]
 MOST_BASIC = 10
@@ -99,3 +101,14 @@ def test_a_misspelt_command_or_option_names_the_nearest_below_the_usage_of_its_c
 ) -> None:
     outcome = run(*arguments)
     assert outcome.code == 2 and outcome.err.startswith(usage) and sentence in outcome.err
+
+
+@pytest.mark.parametrize(("text", "value"), [("0,95", 0.95), ("0,125", 0.125), ("-1,5e-3", -1.5e-3), ("12.5", 12.5)])
+def test_a_number_may_have_a_decimal_comma(text: str, value: float) -> None:
+    assert number(text) == value
+
+
+@pytest.mark.parametrize("text", ["1,000", "12,345", "1,2,3", "1.000,5", ","])
+def test_a_number_that_could_be_a_thousand_or_a_list_is_rejected(text: str) -> None:
+    with pytest.raises(argparse.ArgumentTypeError, match="is not a number"):
+        number(text)

@@ -8,11 +8,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from shapespace.correspondence.odd_scans import ScanMeasures, _medians_of_others, find_odd_scans
+from shapespace.correspondence.odd_scans import (
+    ScanMeasures,
+    _medians_of_others,
+    find_mirrored_scans,
+    find_odd_scans,
+    side_sample,
+)
 from shapespace.datasets.bones import Bone
 from shapespace.datasets.faces import load_faces
 from shapespace.datasets.organs import Organ, raw_surface
+from shapespace.geometry.mirror_plane import mirror_image
 from shapespace.types import MM_PER_UNIT, Mesh
+from synthetic_shapes import twisted
 
 COUNT = 12
 
@@ -124,3 +132,25 @@ def test_the_median_of_the_others_is_that_without_the_row() -> None:
         values = rng.integers(0, 5, (count, 6)).astype(np.float64)  # with equal numbers
         wanted = [np.median(np.delete(values, k, axis=0), axis=0) for k in range(count)]
         assert np.array_equal(_medians_of_others(values), wanted)
+
+
+def screw(rng: np.random.Generator) -> Mesh:
+    """Return a twisted organ, which has a side, in any pose and size."""
+    mesh = twisted(organ(rng))
+    return mesh.with_vertices(Rotation.random(random_state=rng).apply(mesh.vertices.copy()) * rng.uniform(0.5, 2.0))
+
+
+def sampled(kind: Callable[[np.random.Generator], Mesh], mirrored: tuple[int, ...], count: int = COUNT) -> list[int]:
+    meshes = [kind(np.random.default_rng(k)) for k in range(count)]
+    return find_mirrored_scans([side_sample(mirror_image(m) if k in mirrored else m) for k, m in enumerate(meshes)])
+
+
+@pytest.mark.parametrize("mirrored", [(), (2, 7, 9), (0, 6)])
+def test_mirror_images_of_most_are_named_in_any_pose_and_size(mirrored: tuple[int, ...]) -> None:
+    assert sampled(screw, mirrored) == list(mirrored)
+    assert sampled(screw, tuple(set(range(COUNT)) - set(mirrored))) == list(mirrored)
+
+
+@pytest.mark.parametrize("kind", [bone, organ, face])
+def test_no_side_is_found_of_symmetric_objects_or_few_scans(kind: Callable[[np.random.Generator], Mesh]) -> None:
+    assert sampled(kind, (2, 7, 9)) == [] == sampled(screw, (2,), count=9)

@@ -7,6 +7,7 @@ from shapespace.datasets.simulated_scan import (
     Cut,
     Hair,
     Hole,
+    Retriangulation,
     random_similarity,
     retriangulate,
     simulate_scan,
@@ -50,6 +51,18 @@ def test_new_vertices_lie_on_the_surface_and_none_is_an_old_one(face: Mesh) -> N
     # The border loses a few tenths of a millimetre at its corners; the inside does not.
     assert np.quantile(distance_to(new, face.vertices), 0.95) < 0.1
     assert np.sqrt((distance_to(face, vertices[faces].mean(axis=1)) ** 2).mean()) < 0.05
+
+
+def test_scans_that_share_triangles_lie_on_their_own_surfaces(face: Mesh) -> None:
+    rng = np.random.default_rng(0)
+    shared = Retriangulation.of(face, rng, 8_000)
+    wider = face.with_vertices(face.vertices * [1.1, 1.0, 1.0])
+    first, second = (simulate_scan(wider, rng, triangles=shared, noise_mm=0.0).scan for _ in range(2))
+    for scan in (first, second):
+        assert scan.faces is not None and len(scan.faces) == len(shared.faces)
+        assert distance_to(wider, scan.vertices).max() < 1e-6
+        assert (cKDTree(scan.vertices).query(wider.vertices)[0] < 0.01).mean() < 0.005
+    assert cKDTree(first.vertices).query(second.vertices)[0].mean() > 0.05
 
 
 def test_new_triangles_keep_their_winding_and_the_border(face: Mesh) -> None:

@@ -147,6 +147,16 @@ def test_a_start_that_was_near_is_not_cut_and_one_far_away_makes_nothing_small(
     assert far > near
 
 
+def test_a_single_stage_is_drawn_from_both_sides_next_to_each_other(head: MakeHead) -> None:
+    fit = make_fit(head(10))
+    alone = replace(fit, surfaces={"final": fit.surfaces["final"]})
+    figure = figures.overlay_figure(alone)
+    front, side = pictures(figure)
+    assert front.shape == side.shape and 2 * front.shape[1] <= draw.WIDTH
+    assert (front != side).any()
+    assert words(figure).count("phase 2") == 2
+
+
 def test_distances_in_front_and_behind_have_opposite_colours_on_one_scale(head: MakeHead) -> None:
     mesh = head(10)
     for sign, channel in ((1.0, 0), (-1.0, 2)):

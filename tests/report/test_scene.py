@@ -126,15 +126,13 @@ def test_nothing_zeros_and_unknowns_can_be_rounded(values: np.ndarray) -> None:
 
 def test_a_model_comes_back_to_a_thousandth_of_a_millimetre() -> None:
     model = blob_model()
-    facts, arrays = unpack(scene.pack_model(model))
+    _, arrays = unpack(scene.pack_model(model))
     assert np.array_equal(arrays["faces"], model.faces)
     z = np.random.default_rng(1).normal(size=model.n_modes)
     shown = arrays["mean"] + np.tensordot(z, arrays["modes"], 1)
     assert np.abs(shown - model.reconstruct(z * model.stddev)).max() < 1e-3
     assert np.allclose(arrays["stddev"], model.stddev, rtol=1e-6)
     assert np.allclose(np.cumsum(arrays["share"]), model.cumulative_variance, rtol=1e-5)
-    assert facts["n_training"] == model.n_training
-    assert facts["gauge"] == model.gauge
 
 
 def test_a_small_model_is_the_same_surface_in_another_order() -> None:
@@ -142,7 +140,6 @@ def test_a_small_model_is_the_same_surface_in_another_order() -> None:
     model = replace(blob_model(), landmarks=SurfaceLandmarks(("top", "between"), corners, weights))
     facts, arrays = unpack(scene.pack_model(model, 2, small=True))
     _, plain = unpack(scene.pack_model(model, 2))
-    assert facts["n_modes"] == model.n_modes
     assert arrays["modes"].shape == (2, model.n_vertices, 3)
     for name, expected in model.landmarks.positions(model.mean_vertices).items():
         at = facts["landmarks"][name]
@@ -192,7 +189,7 @@ def test_a_small_fit_is_small_and_true_where_it_has_points(staged: StagedFit) ->
     facts, arrays = unpack(scene.pack_fit(staged, largest_scan=400))
     whole = scene.pack_fit(staged)
     assert len(arrays["scan_faces"]) <= 400 and len(arrays["faces"]) <= 400
-    assert facts["thinned"] and facts["scan_faces"] == len(staged.scan.faces if staged.scan.faces is not None else [])
+    assert facts["thinned"]
     assert len(scene.payload_html("x", scene.pack_fit(staged, largest_scan=400))) < 0.3 * len(whole)
     for points, mesh, distances, key in (
         (arrays["scan"], staged.scan, staged.scan_to_model_mm, "scan_to_model"),
@@ -218,7 +215,9 @@ def test_the_numbers_of_a_fit_are_of_all_its_vertices(staged: StagedFit, largest
             known = np.abs(given[np.isfinite(given)])
             assert facts["mean_mm"][stage][key] == pytest.approx(known.mean())
             for k in (0, 2, 20, 100):
-                assert arrays[f"beyond_{key}_{stage}"][k] == pytest.approx((known > k / 10).mean(), abs=1e-6)
+                assert arrays[f"beyond_{key}_{stage}"][k] == pytest.approx(
+                    (known > k / 50 * staged.scale_mm).mean(), abs=1e-6
+                )
     assert facts["region_shares"] == pytest.approx([(staged.regions == k).mean() for k in range(4)])
     nothing = {stage: np.full_like(values, np.nan) for stage, values in staged.scan_to_model_mm.items()}
     facts, _ = unpack(scene.pack_fit(replace(staged, scan_to_model_mm=nothing)))

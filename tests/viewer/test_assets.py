@@ -4,8 +4,6 @@ import hashlib
 import re
 from importlib.resources import files
 
-import pytest
-
 from shapespace.viewer.server import ASSETS, PAGES, SCENE
 
 
@@ -20,13 +18,12 @@ def test_the_page_asks_only_for_files_that_are_served_and_for_each_of_them() -> 
     assert all(path.is_file() for path in ASSETS.values())
 
 
-@pytest.mark.parametrize("name", ["preact-htm.min.js", "uPlot.iife.min.js", "uPlot.min.css"])
-def test_a_library_is_the_file_that_its_readme_records(name: str) -> None:
+def test_the_library_is_the_file_that_its_readme_records() -> None:
     folder = files("shapespace.viewer").joinpath("assets/vendor")
-    assert hashlib.sha256(folder.joinpath(name).read_bytes()).hexdigest() in folder.joinpath("README.md").read_text()
+    library = folder.joinpath("preact-htm.min.js").read_bytes()
+    assert hashlib.sha256(library).hexdigest() in folder.joinpath("README.md").read_text()
 
 
 def test_the_licences_of_the_libraries_come_with_them() -> None:
     folder = files("shapespace.viewer").joinpath("assets/vendor")
-    assert "Leon Sorokin" in folder.joinpath("LICENSE-UPLOT").read_text("utf-8")
     assert "Apache License" in folder.joinpath("LICENSE-APACHE").read_text("utf-8")

@@ -12,12 +12,13 @@ from test_studio_server import ended, own_home, state, studio, until, upload
 from shapespace.datasets.bones import Bone
 from shapespace.datasets.organs import raw_surface
 from shapespace.errors import InputError
+from shapespace.geometry.mirror_plane import mirror_image
 from shapespace.geometry.normals import faces_of
 from shapespace.geometry.volume_surface import count_labels
 from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.io.volume_io import read_volume
 from shapespace.types import LabelVolume, Mesh, Segment
-from synthetic_shapes import sphere
+from synthetic_shapes import sphere, twisted
 
 __all__ = ["own_home"]
 
@@ -93,10 +94,17 @@ def test_dropped_volumes_become_specimens_by_a_recorded_command(tmp_path: Path) 
             drop(client, nifti(tmp_path / "other" / "anna.nii.gz", balls(2))),
             drop(client, tmp_path / "other" / "anna.nii.gz"),
         ]
-        assert files == ["scans/anna.nii.gz", "scans/ben.nii.gz", "scans/anna-2.nii.gz", "scans/anna-3.nii.gz"]
+        assert files == ["scans/anna.nii.gz", "scans/ben.nii.gz", "scans/anna-2.nii.gz", "scans/anna-2.nii.gz"]
+        again = client.put("/api/volumes", params={"name": "z.nii.gz"}, content=(tmp_path / "ben.nii.gz").read_bytes())
+        assert again.json() == {"file": "scans/ben.nii.gz", "same_as": "ben.nii.gz"}
+        assert len(list((tmp_path / "p" / "scans").iterdir())) == 3
+        values = balls(2)
+        values[0, 0, 0] = 3  # another volume with the same surface of label 2
+        files[3] = drop(client, nifti(tmp_path / "other" / "anna.nii.gz", values))
+        assert files[3] == "scans/anna-3.nii.gz"
         assert state(client)["specimens"] == []
         labels = [client.post("/api/labels", json={"file": file}).json() for file in files]
-        assert [[label["choice"] for label in one] for one in labels] == [["1", "2"], ["1"], ["2"], ["2"]]
+        assert [[label["choice"] for label in one] for one in labels] == [["1", "2"], ["1"], ["2"], ["2", "3"]]
         run(client, "surface", {"files": files, "set": "new", "--label": "2", "--smooth": "0.8"})
         project = until(client, lambda now: ended(now) and len(now["specimens"]) == 2)
         (job,) = project["jobs"]
@@ -208,6 +216,22 @@ def test_a_result_of_the_scan_before_it_was_groomed_is_outdated(tmp_path: Path) 
     assert project.undo_text == "groom a" and done.outdated == {1: "specimens"}
     project.undo(project.revision)
     assert not done.outdated
+
+
+def test_a_mirrored_specimen_is_named_before_the_correspondence_until_it_is_mirrored(tmp_path: Path) -> None:
+    with studio(tmp_path / "p") as client:
+        for k in range(10):
+            bone = twisted(raw_surface(Bone.draw(np.random.default_rng(k)), np.random.default_rng(k), 600))
+            scan = tmp_path / f"bone{k}.ply"
+            write_mesh(scan, mirror_image(bone) if k == 4 else bone)
+            client.put("/api/specimens", params={"name": scan.name}, content=scan.read_bytes())
+        project = until(client, lambda now: all(one["state"] == "ready" for one in now["specimens"]))
+        question = {"kind": "correspond", "options": {}}
+        warnings = [check["text"] for check in client.post("/api/checks", json=question).json()[1:]]
+        assert len(warnings) == 1 and warnings[0].startswith("bone4: Probably a mirror image of most others")
+        mirror = {"what": "mirror", "ids": ["bone4"], "mirrored": True, "revision": project["revision"]}
+        client.post("/api/edit", json=mirror)
+        assert len(client.post("/api/checks", json=question).json()) == 1
 
 
 def test_a_specimen_in_another_unit_is_named_before_the_correspondence_until_its_unit_is_set(tmp_path: Path) -> None:

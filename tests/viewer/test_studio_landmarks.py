@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from test_studio_project import Done, edit, project, tetrahedron
-from test_studio_server import own_home, state, studio, upload
+from test_studio_server import own_home, state, studio, until, upload
 
 from shapespace.cli import main, parser
 from shapespace.cli.command_table import summaries_and_options
@@ -20,8 +20,8 @@ from shapespace.model.build_model import build_model
 from shapespace.types import SurfaceLandmarks
 from shapespace.viewer.studio.job_commands import order
 from shapespace.viewer.studio.jobs import Job, history
-from shapespace.viewer.studio.landmark_import import is_landmark_table, points_of_file
-from shapespace.viewer.studio.project import Project, StaleError, with_points
+from shapespace.viewer.studio.landmark_import import is_landmark_table, read_points
+from shapespace.viewer.studio.project import Project, ScanCurve, StaleError, with_points
 from synthetic_shapes import training_meshes
 
 __all__ = ["own_home", "project"]  # fixtures
@@ -34,8 +34,8 @@ SLICER = """{"markups": [{"type": "Fiducial", "coordinateSystem": "RAS", "contro
 
 
 def take(project: Project, content: bytes, name: str) -> list[str]:
-    names, points, notes = points_of_file(content, name, project.state)
-    project.edit(None, with_points(names, points), together="import landmarks")
+    names, points, curves, notes = read_points(content, name, project.state)
+    project.edit(None, with_points(names, points, curves), together="import landmarks")
     return notes
 
 
@@ -87,10 +87,13 @@ def test_a_file_of_landmarks_that_cannot_be_used_is_refused_in_a_sentence_with_i
     assert project.state == before and "shapespace-" not in str(error.value)
 
 
-def test_points_of_curves_are_not_imported(project: Project) -> None:
+def test_points_of_curves_are_imported_with_the_name_of_their_curve(project: Project) -> None:
     content = b"LM3=1\n1 2 3\nCURVES=1\nPOINTS=3\n1 1 1\n2 2 2\n3 3 3\nID=anna\n"
-    assert take(project, content, "x.tps") == ["x.tps: the points of curves are semilandmarks, which are not imported."]
-    assert points(project) == {"anna": {"1": (1, 2, 3)}}
+    assert take(project, content, "x.tps") == ["1 points of 1 curve are semilandmarks."]
+    assert points(project) == {
+        "anna": {"1": (1, 2, 3), "curve 1_1": (1, 1, 1), "curve 1_2": (2, 2, 2), "curve 1_3": (3, 3, 3)}
+    }
+    assert project.state.curves == {"curve 1": ScanCurve(3)}
 
 
 @pytest.mark.parametrize(("name", "content", "expected"), [
@@ -290,3 +293,22 @@ def test_dropped_files_of_landmarks_and_edits_come_over_http(tmp_path: Path) -> 
         assert client.post("/api/edit", json={**place, "before": {"nose": [1, 2, 3]}}).status_code == 200
         assert client.post("/api/edit", json={**place, "before": {"nose": [1, 2, 3]}}).status_code == 409
         assert ".fcsv" in client.get("/api/project").json()["landmark_formats"]
+
+
+def test_landmarks_that_are_not_on_their_scan_are_named_on_import_and_before_a_question(tmp_path: Path) -> None:
+    with studio(tmp_path / "p") as client:
+        upload(client, tmp_path, 2)
+        until(client, lambda now: all(one["state"] == "ready" for one in now["specimens"]))
+        corners = {name: read_mesh(tmp_path / f"{name}.ply").vertices[:4] for name in ("s0", "s1")}
+        for scale, named in ((1.0, set()), (10.0, {"s0"})):  # as in cm among mm
+            rows = [
+                f"{name},m{k},{','.join(map(str, corner * (scale if name == 's0' else 1.0)))}"
+                for name, points in corners.items()
+                for k, corner in enumerate(points)
+            ]
+            text = "\n".join(["specimen,landmark,x,y,z", *rows]).encode()
+            sent = client.post("/api/table", params={"name": "marks.csv", "kind": "landmarks"}, content=text)
+            assert {note.split(":")[0] for note in sent.json()["notes"]} == named, sent.text
+            asked = {"kind": "morphospace", "options": {}, "on": 0}
+            found = [one["text"] for one in client.post("/api/checks", json=asked).json()]
+            assert {text.split(":")[0] for text in found if "not on its scan" in text} == named

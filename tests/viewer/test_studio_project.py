@@ -1,8 +1,9 @@
 """The project of the studio: what its edits do, what undo takes back, and what is refused."""
 
+import filecmp
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +48,9 @@ def project(tmp_path: Path) -> Project:
     return made
 
 
+DORSAL: dict[str, Any] = {"name": "dorsal", "toward_viewer": [0.0, 0.6, 0.8], "up": [1.0, 0.0, 0.0]}
+
+
 def edit(project: Project, **request: object) -> None:
     project.edit(project.revision, change_of(request))
 
@@ -76,6 +80,8 @@ def test_undo_takes_every_edit_back_and_redo_applies_it_again(project: Project) 
         {"what": "set", "ids": ["carl"], "set": "new"},
         {"what": "rename", "id": "carl", "to": "carol"},
         {"what": "landmarks", "landmarks": {"tip": 3}},
+        {"what": "views", "on": "correspondence-1", "views": [DORSAL], "before": []},
+        {"what": "views", "on": "correspondence-1", "views": [{**DORSAL, "name": "lateral"}], "before": [DORSAL]},
         {"what": "remove", "ids": ["ben"]},
         {"what": "remove-column", "column": "sex"},
     ):
@@ -112,6 +118,11 @@ def test_an_edit_of_a_state_that_another_tab_changed_is_refused(project: Project
     ({"what": "unit", "ids": ["anna"], "unit": "mile"}, "no unit 'mile'"),
     ({"what": "cells"}, "cannot be read"),
     ({"what": "nonsense"}, "cannot be read"),
+    ({"what": "views", "on": "", "views": [{**DORSAL, "name": " "}], "before": []}, "cannot be called"),
+    ({"what": "views", "on": "", "views": [DORSAL, DORSAL], "before": []}, "that no other has"),
+    ({"what": "views", "on": "", "views": [{**DORSAL, "up": [0.0, 3.0, 4.0]}], "before": []}, "not parallel"),
+    ({"what": "views", "on": "", "views": [{**DORSAL, "up": [0.0, 1.0]}], "before": []}, "cannot be read"),
+    ({"what": "views", "on": "", "views": []}, "cannot be read"),
     ({"what": "include", "ids": 5}, "cannot be read"),
 ])  # fmt: skip
 def test_an_edit_that_cannot_be_is_refused_in_a_sentence(
@@ -151,6 +162,39 @@ def test_a_folder_is_imported_by_reference_or_as_copies(project: Project, tmp_pa
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="contains no meshes"):
         project.import_files(tmp_path / "empty", "training", copy=False)
+
+
+def test_thousands_of_scans_of_one_size_are_one_edit_and_take_a_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    project, scans, count = Project.open(tmp_path / "many", create=True), make_folder(tmp_path / "scans"), 2000
+    for k in range(count):
+        (scans / f"s{k:05}.obj").write_text(f"v 0 0 0\nv {1 + 1e-4 * k:.4f} 0 0\nv 0 1 0\nf 1 2 3\n")
+    shutil.copyfile(scans / "s00007.obj", scans / "twin.obj")
+    calls = {"write": 0, "compare": 0}
+
+    def counted(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*given: Any, **options: Any) -> Any:
+            calls[name] += 1
+            return function(*given, **options)
+
+        return call
+
+    monkeypatch.setattr(Project, "_write", counted("write", Project._write))
+    monkeypatch.setattr("filecmp.cmp", counted("compare", filecmp.cmp))
+    added, notes = project.import_files(scans, "training", copy=False)
+    assert (added, len(notes)) == (count, 1) and "twin.obj is the same file as s00007" in notes[0]
+    assert calls == {"write": 1, "compare": 1}
+    table = "".join(f"s{k:05},{'fm'[k % 2]},{k}\n" for k in range(10_000))
+    columns, cells, notes = cells_of_table(f"specimen,sex,age\n{table}".encode(), project.state)
+    assert columns == ["sex", "age"] and len(cells) == count and "8000 of 10000 rows" in notes[0]
+    project.edit(None, with_cells(columns, cells))
+    edit(project, what="cells", cells=[{"id": "s01999", "column": "age", "value": "7", "before": "1999"}])
+    assert Project.open(project.folder).state.specimens[-1].cells == {"sex": "m", "age": "7"}
+    project.undo(project.revision)
+    project.undo(project.revision)
+    project.undo(project.revision)
+    assert project.state.specimens == ()
 
 
 def test_a_table_is_joined_by_id_or_file_name_and_may_be_pasted(project: Project) -> None:
@@ -301,6 +345,18 @@ def test_a_cell_that_another_tab_changed_while_it_was_typed_is_not_overwritten(w
         edit(weighed, what="cells", cells=[cell])
     edit(weighed, what="cells", cells=[{**cell, "before": "f"}])
     assert weighed.state.specimens[1].cells["sex"] == "m"
+
+
+def test_named_views_that_another_tab_changed_are_not_overwritten(project: Project) -> None:
+    views: dict[str, Any] = {"what": "views", "on": "", "views": [DORSAL], "before": []}
+    edit(project, **views)
+    edit(project, **{**views, "on": "correspondence-1"})
+    for before in ([], [{**DORSAL, "up": [-1.0, 0.0, 0.0]}]):
+        with pytest.raises(StaleError, match="changed the named views"):
+            edit(project, **{**views, "views": [], "before": before})
+    edit(project, **{**views, "views": [], "before": [DORSAL]})
+    stored = Project.open(project.folder).state.views
+    assert stored[""] == () and [view.name for view in stored["correspondence-1"]] == ["dorsal"]
 
 
 def test_scans_in_another_unit_or_mirrored_are_written_in_mm_for_the_commands(

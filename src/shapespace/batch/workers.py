@@ -89,7 +89,11 @@ WARM_UP = "SHAPESPACE_WARM_UP"
 COPIED = sys.platform == "linux"
 """Whether workers are copies of one server. Apple's BLAS does not support fork, and Windows has no fork."""
 _WARM = "shapespace.batch.warm"  # loads the code of a fit; imports this module
-DRAWING = ("shapespace.report.pages.page", "shapespace.report.figures.fit_figures")
+DRAWING = (
+    "shapespace.report.pages.page",
+    *(f"shapespace.report.figures.{name}" for name in ("fit_figures", "model_figures", "population_figures")),
+    "shapespace.report.figures.first_figure",
+)
 """Modules of processes that draw figures of fits."""
 _BLAS_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 

@@ -32,7 +32,8 @@ class InputAccepted(Exception):  # noqa: N818 - no error
 
 
 def reason_of_rejection(words: Sequence[str], folders: Sequence[Path]) -> str:
-    """Return why the command of a question would reject its input; empty if it begins to compute.
+    """Return why the command of a question would reject its input; empty if it begins to compute. `align`, which
+    questions about landmarks read, computes its result.
 
     Args:
         words: arguments of the command.
@@ -186,6 +187,8 @@ def answer_align(arguments: argparse.Namespace) -> Outcome:
     config = AlignConfig(**given(arguments, AlignConfig))
     reflect = column_value(arguments.reflect, "--reflect") if arguments.reflect else None
     _, record = align(arguments.data, arguments.output, config, **given(arguments, align, reflect=reflect))
+    if hasattr(arguments, "only_check"):
+        raise InputAccepted
     check = len({finding.specimen for finding in record.findings})
     lines = [
         f"{record.specimens} specimens with {record.landmarks} landmarks ({record.dimensions}-D) are aligned.",

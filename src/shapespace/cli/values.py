@@ -7,6 +7,8 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+_DECIMAL_COMMA = re.compile(r"([+-]?[0-9]*),([0-9]+(?:[eE][+-]?[0-9]+)?)")
+_THOUSANDS = re.compile(r"[+-]?[1-9][0-9]{0,2},[0-9]{3}")
 _LARGEST = 2**63
 """Bound of integers: JSON, in which all settings are written, has no larger ones."""
 
@@ -41,9 +43,14 @@ def positive(text: str) -> int:
 def number(text: str) -> float:
     """Return a number."""
     try:
-        return float(text)
+        return _decimal(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number") from None
+
+
+def _decimal(text: str) -> float:
+    """Return a number with a decimal point or comma; 1,000 is rejected, as it may be a thousand."""
+    return float(text if _THOUSANDS.fullmatch(text) else _DECIMAL_COMMA.sub(r"\1.\2", text))
 
 
 def probability(text: str) -> float:
@@ -79,7 +86,7 @@ def smoothing(text: str) -> float:
 
 def _parse_number(text: str, accepts: Callable[[float], bool], accepted: str) -> float:
     try:
-        value = float(text)
+        value = _decimal(text)
     except ValueError:
         value = float("nan")  # which no comparison accepts
     if not accepts(value):

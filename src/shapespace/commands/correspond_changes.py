@@ -31,7 +31,7 @@ from shapespace.commands.correspond import (
     read_scans,
     with_scans,
 )
-from shapespace.commands.inputs import Given, LandmarkFiles
+from shapespace.commands.inputs import TABLE_ENDINGS, Given, LandmarkFiles
 from shapespace.commands.outcome import Aside, Outcome, first_lines
 from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
 from shapespace.correspondence.groupwise import FinishedCorrespondence, add_scans
@@ -275,10 +275,11 @@ def _check_unchanged(finished: _FinishedFolder, read: ScansRead, files: Correspo
             raise InputError(f"--update reads all scans again, and {name} is {read.unread[name]}")
         if read.hashes[name] != record.hash:
             raise InputError(f"{record.path} has changed since it was registered; run --redo {name} before --update.")
+    is_listed = any(str(scan).lower().endswith(TABLE_ENDINGS) for scan in files.scans)  # with its landmarks, if any
     for name, scan in read.scans.items():
         had = name in finished.records and finished.records[name].landmark_distances
-        if had and not scan.landmarks and files.landmarks is None:
-            raise InputError(f"{name} was registered with landmarks; give them again with --landmarks.")
+        if had and not scan.landmarks and files.landmarks is None and not is_listed:
+            raise InputError(f"{name} was registered with landmarks; give them again with --landmarks, or by a list.")
 
 
 # Their registration

@@ -24,7 +24,9 @@ from shapespace.reprs import first_names
 from shapespace.store.corresponding import SurfaceFiles
 from shapespace.types import MM_PER_UNIT, Mesh
 
-_LISTS = (".csv", ".tsv", ".txt", ".xlsx")
+TABLE_ENDINGS = (".csv", ".tsv", ".xlsx")
+"""Endings of lists of scans that are tables, which may name landmarks."""
+_LISTS = (*TABLE_ENDINGS, ".txt")
 _PLACES = ("scan", "file", "path", "specimen", "name", "id")
 _LANDMARKS, _ID = "landmarks", "id"
 _LARGEST_BYTES = 2**26

@@ -236,11 +236,12 @@ def unit_ratios(scales: Sequence[float]) -> tuple[FloatArray, FloatArray]:
         (N,) sizes relative to the median of most scans, in one unit, and (N,) ratios of the unit to that of most scans,
         in terms of coordinates, such as 0.001 for metres among millimetres; 1 for most.
     """
-    logs = np.log(np.asarray(scales, dtype=np.float64))
-    near = np.abs(logs[:, None] - logs) < 0.5 * np.log(LEAST_RATIO)
+    logs: FloatArray = np.log(np.asarray(scales, dtype=np.float64))
+    reach, ordered = 0.5 * float(np.log(LEAST_RATIO)), np.sort(logs)
+    near = np.searchsorted(ordered, logs + reach) - np.searchsorted(ordered, logs - reach, side="right")
     # If two units are equally frequent, the smaller unit counts as usual.
-    most = max(range(len(logs)), key=lambda i: (int(near[i].sum()), logs[i]))
-    relative = logs - np.median(logs[near[most]])
+    most = logs[np.lexsort((logs, near))[-1]]
+    relative = logs - np.median(logs[np.abs(logs - most) < reach])
     ratios = _RATIOS[np.abs(relative[:, None] - np.log(_RATIOS)).argmin(axis=1)]
     return np.exp(relative) / ratios, ratios
 

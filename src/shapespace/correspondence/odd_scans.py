@@ -1,17 +1,18 @@
-"""Scans that differ from the others in size, unit or kind of object, found before a correspondence by cheap measures.
-
-The side of a scan is not found: only the comparison of registered surfaces shows it.
-"""
+"""Scans that differ from the others in size, unit, side or kind, found before a correspondence by cheap measures."""
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import permutations, product
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from shapespace.correspondence.correspondence_result import ENOUGH_TO_COMPARE, LEAST_RATIO, OTHER_SIZE, unit_ratios
-from shapespace.geometry.normals import face_areas, rms_size
+from shapespace.geometry.mirror_plane import ASYMMETRIC, FLIP
+from shapespace.geometry.normals import face_areas, face_vectors, faces_of, rms_size
 from shapespace.types import MM_PER_UNIT, FloatArray, Mesh
 
 _UNSEEN = 6.0
@@ -25,6 +26,17 @@ which it is farther than those of the usual shapes. Of 24 femora, molars, spleen
 2.6, and that of other objects at least 6.8, except between molars and spleens, whose profiles are alike. In collections
 of 4 to 24, one of another kind was found in 79 to 100 %, and 1 % of pure ones had a false finding; of simulated bones,
 organs and faces 5 %, 3 % and none."""
+
+_SAMPLED, _COARSE, _MATCHED = 500, 60, 100  # points of a sample, those that rank starts, and those that are matched
+_STARTS, _ITERATIONS = 2, 5  # poses that are refined, and steps of each
+_LEAST_SIDES = 10
+"""Number of scans from which their sides are judged: two anchors agree by chance on the sides of all with a probability
+of 0.4 %. In collections of 10 to 24 femora or hippocampi, all mirrored scans were named; a scan was named wrongly in at
+most 0.8 % of collections of molars, and in fewer of spleens and of simulated bones, organs and faces."""
+_AXES = np.array(
+    [np.diag(signs)[list(order)] for order in permutations(range(3)) for signs in product((1.0, -1.0), repeat=3)]
+)
+_TURNS = _AXES[np.linalg.det(_AXES) > 0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,25 +116,29 @@ def find_odd_scans(measures: Sequence[ScanMeasures], units: Sequence[str]) -> di
     mm = np.array([MM_PER_UNIT[unit] for unit in units])
     relative, ratios = unit_ratios((mm * [measure.size for measure in measures]).tolist())
     sizes, shape_ratios = np.log(relative * ratios), _shape_ratios(np.stack([measure.profile for measure in measures]))
+    usual = np.flatnonzero(ratios == 1.0)
+    if not len(usual):
+        return {}
+    lows, highs, middles = (np.full(len(sizes), of(sizes[usual])) for of in (np.min, np.max, np.median))
+    if len(usual) > 1:
+        order = usual[sizes[usual].argsort()]
+        lows[order[0]], highs[order[-1]] = sizes[order[1]], sizes[order[-2]]
+        middles[usual] = _medians_of_others(sizes[usual, None])[:, 0]
+    gaps, widths = np.maximum(lows - sizes, sizes - highs), highs - lows
+    odd_sizes = (gaps > widths) & (np.abs(sizes - middles) > np.log(OTHER_SIZE))
     found: dict[int, OddScan] = {}
-    for k, shape_ratio in enumerate(shape_ratios.tolist()):
-        others = sizes[(ratios == 1.0) & (np.arange(len(sizes)) != k)]
-        if not len(others):
-            continue
-        low, high, middle = float(others.min()), float(others.max()), float(np.median(others))
-        gap, width = max(low - sizes[k], sizes[k] - high), high - low
-        is_odd = gap > width and abs(sizes[k] - middle) > np.log(OTHER_SIZE)
-        margin = width * max(0.5, _UNSEEN / len(others))
+    for k in np.flatnonzero(odd_sizes | (shape_ratios != 1.0)).tolist():
+        low, high, gap, width, shape_ratio = (float(values[k]) for values in (lows, highs, gaps, widths, shape_ratios))
+        margin = width * max(0.5, _UNSEEN / max(len(usual) - (ratios[k] == 1.0), 1))
         changes = {unit: float(np.log(length / mm[k])) for unit, length in MM_PER_UNIT.items()}
         fitting = [
             unit
             for unit, change in changes.items()
             if low - margin <= sizes[k] + change <= high + margin and abs(change) > np.log(LEAST_RATIO)
         ]
-        if is_odd or shape_ratio != 1.0:
-            is_clear = gap > width + 2.0 * margin and shape_ratio == 1.0 and len(fitting) == 1
-            unit = fitting[0] if is_odd and is_clear else ""
-            found[k] = OddScan(float(np.exp(sizes[k] - middle)) if is_odd else 1.0, unit, shape_ratio)
+        is_clear = gap > width + 2.0 * margin and shape_ratio == 1.0 and len(fitting) == 1
+        unit = fitting[0] if odd_sizes[k] and is_clear else ""
+        found[k] = OddScan(float(np.exp(sizes[k] - middles[k])) if odd_sizes[k] else 1.0, unit, shape_ratio)
     return found
 
 
@@ -142,3 +158,86 @@ def _medians_of_others(values: FloatArray) -> FloatArray:
     middles = ((len(values) - 2) // 2, (len(values) - 1) // 2)
     low, high = (np.take_along_axis(ordered, middle + (rank <= middle), axis=0) for middle in middles)
     return 0.5 * (low + high)
+
+
+def side_sample(mesh: Mesh) -> FloatArray:
+    """Return points of a surface and their normals, (500, 6), centred and scaled to an RMS size of 1, for
+    `find_mirrored_scans`. They are random in each scan: on equal triangles they would be at the same places.
+    """
+    rng = np.random.default_rng(zlib.crc32(mesh.vertices.tobytes()))
+    vectors = face_vectors(mesh.vertices, faces_of(mesh))
+    areas = np.linalg.norm(vectors, axis=1)
+    chosen = rng.choice(len(areas), _SAMPLED, p=areas / areas.sum())
+    points = np.einsum("nk,nkd->nd", rng.dirichlet(np.ones(3), _SAMPLED), mesh.vertices[faces_of(mesh)[chosen]])
+    points = points - points.mean(axis=0)
+    return np.hstack([points / rms_size(points), vectors[chosen] / areas[chosen, None]])
+
+
+class _Side:
+    """A sample of a scan with its principal axes and nearest points."""
+
+    def __init__(self, sample: FloatArray) -> None:
+        self.points, self.normals = np.hsplit(np.asarray(sample, dtype=np.float64), 2)
+        self.near = KDTree(self.points)
+        self.axes = np.linalg.eigh(self.points.T @ self.points)[1]
+        self.axes[:, 2] *= np.linalg.det(self.axes)
+
+    def nearest(self, places: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the distances (S, N) of places (S, N, 3), and the points and normals (S, N, 3) that are nearest."""
+        distances, k = self.near.query(places)
+        return np.asarray(distances), self.points[k], self.normals[k]
+
+    def distance(self, other: _Side) -> float:
+        """Return the mean distance between two surfaces in their best pose: rigid ICP from some of the 24 poses that
+        align their principal axes."""
+        R = self.axes @ _TURNS @ other.axes.T
+        far = self.nearest(other.points[:_COARSE] @ R.transpose(0, 2, 1))[0].mean(axis=1)
+        R, t = R[far.argsort()[:_STARTS]], np.zeros((_STARTS, 3))
+        own, theirs = self.points[:_MATCHED], other.points[:_MATCHED]
+        for _ in range(_ITERATIONS):
+            there, back = theirs @ R.transpose(0, 2, 1) + t[:, None], (own - t[:, None]) @ R
+            (forward, y, _), (backward, x, _) = self.nearest(there), other.nearest(back)
+            a, b = (np.concatenate(np.broadcast_arrays(*points), axis=1) for points in ((y, own), (theirs, x)))
+            distances = np.concatenate([forward, backward], axis=1)
+            w = (1.0 + (distances / (2.0 * np.median(distances, axis=1, keepdims=True))) ** 2)[..., None] ** -2
+            mean_a, mean_b = ((w * c).sum(axis=1, keepdims=True) / w.sum(axis=1, keepdims=True) for c in (a, b))
+            u, _, vt = np.linalg.svd((w * (a - mean_a)).transpose(0, 2, 1) @ (b - mean_b))
+            u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
+            R, t = u @ vt, (mean_a - mean_b @ (u @ vt).transpose(0, 2, 1))[:, 0]
+        there, back = theirs @ R.transpose(0, 2, 1) + t[:, None], (own - t[:, None]) @ R
+        matches = ((there, self.nearest(there)), (back, other.nearest(back)))
+        to_planes = [np.abs(((places - p) * n).sum(axis=-1)).mean(axis=1) for places, (_, p, n) in matches]
+        return float(np.sum(to_planes, axis=0).min())
+
+
+def find_mirrored_scans(samples: Sequence[FloatArray]) -> list[int]:
+    """Return the scans that are mirror images of most, by their index; none if the scans do not show it clearly.
+
+    Each scan and its mirror image are compared with two scans. A scan is named only if both comparisons agree on the
+    sides of all scans, each by more than the differences of symmetric objects.
+
+    Args:
+        samples: sample of each scan, see `side_sample`.
+    """
+    count = len(samples)
+    if count < _LEAST_SIDES:
+        return []
+    sides, images = ([_Side(sample * factors) for sample in samples] for factors in (1.0, np.tile(FLIP, 2)))
+    anchors = (0, count // 2)
+    evidence = np.array(
+        [
+            [
+                np.inf
+                if side is sides[anchor]
+                else np.log(sides[anchor].distance(image) / sides[anchor].distance(side))
+                for side, image in zip(sides, images, strict=True)
+            ]
+            for anchor in anchors
+        ]
+    )
+    first: FloatArray = np.sign(evidence[0])
+    second: FloatArray = np.sign(evidence[1]) * first[anchors[1]]
+    second[anchors[1]] = first[anchors[1]]
+    if np.abs(evidence).min() <= ASYMMETRIC or (first != second).any():
+        return []
+    return np.flatnonzero(first == (1.0 if 2 * (first < 0).sum() > count else -1.0)).tolist()

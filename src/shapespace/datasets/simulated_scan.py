@@ -19,9 +19,12 @@ from scipy.spatial.transform import Rotation
 
 from shapespace.errors import InputError
 from shapespace.geometry import remesh
+from shapespace.geometry.closest import SurfaceEngine
 from shapespace.geometry.normals import face_vectors, faces_of, vertex_normals
 from shapespace.reprs import short_repr
-from shapespace.types import BoolArray, FloatArray, Mesh, Similarity, generator_of, read_only, require
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity, generator_of, read_only, require
+
+LongArray: TypeAlias = npt.NDArray[np.int64]
 
 PLAIN_TRIANGLES = 20_000
 """Number of triangles of a plain scan."""
@@ -79,6 +82,29 @@ class SimulatedScan:
     __repr__ = short_repr
 
 
+@dataclass(frozen=True, eq=False)
+class Retriangulation:
+    """Other vertices and triangles on a surface, found once for many scans of surfaces with its vertices.
+
+    Args:
+        corners: (S, 3) vertices of the surface around each new vertex.
+        weights: (S, 3) barycentric coordinates of the new vertex in them.
+        faces: (T, 3) triangles of the new vertices.
+    """
+
+    corners: IntArray
+    weights: FloatArray
+    faces: LongArray
+
+    @staticmethod
+    def of(mesh: Mesh, rng: np.random.Generator, triangles: int) -> Retriangulation:
+        """Return a re-triangulation with about `triangles` triangles; arguments and errors as in `retriangulate`."""
+        vertices, faces = retriangulate(mesh, rng, triangles)
+        matches = SurfaceEngine(mesh).query(vertices)
+        assert matches.triangle is not None and matches.barycentric is not None
+        return Retriangulation(faces_of(mesh)[matches.triangle], matches.barycentric, faces)
+
+
 def random_similarity(
     rng: np.random.Generator,
     max_angle_deg: float = 20.0,
@@ -110,7 +136,7 @@ def simulate_scan(
     mesh: Mesh,
     rng: np.random.Generator | int,
     *,
-    triangles: int = 40_000,
+    triangles: int | Retriangulation = 40_000,
     noise_mm: float = 0.2,
     T_scan_model: Similarity | None = None,
     holes: Sequence[Hole] = (),
@@ -126,7 +152,8 @@ def simulate_scan(
     Args:
         mesh: the true surface, in mm, y up and facing +z.
         rng: generator or seed, from which every random choice is made.
-        triangles: number of triangles of the re-triangulated surface, before anything is cut away or added.
+        triangles: number of triangles of the re-triangulated surface, before anything is cut away or added; or a
+            re-triangulation that other scans share, which saves most of the time.
         noise_mm: standard deviation of the noise along the normals, in mm of the model's frame.
         T_scan_model: pose and scale of the scan; None leaves it in the model's frame.
         holes: balls to cut out.
@@ -142,7 +169,7 @@ def simulate_scan(
         MeshError: `mesh` has no faces, edges that more than two triangles share, or neighbours of opposite winding.
     """
     require(mesh, Mesh, "simulate_scan", "convert it with shapespace.as_mesh")
-    if triangles < 4 or noise_mm < 0 or not 0 <= outlier_fraction < 1:
+    if (isinstance(triangles, int) and triangles < 4) or noise_mm < 0 or not 0 <= outlier_fraction < 1:
         raise InputError(
             f"A simulated scan needs at least 4 triangles, noise of at least 0 mm and a share of outliers in [0, 1), "
             f"not {triangles}, {noise_mm} and {outlier_fraction}."
@@ -195,7 +222,7 @@ def plain_scan(mesh: Mesh, rng: np.random.Generator) -> Mesh:
 
 
 def retriangulate(
-    mesh: Mesh, rng: np.random.Generator, triangles: int, *, split: bool = True
+    mesh: Mesh, rng: np.random.Generator, triangles: int | Retriangulation, *, split: bool = True
 ) -> tuple[FloatArray, LongArray]:
     """Return other vertices (S, 3) and triangles (T, 3) on the same surface, T about `triangles`.
 
@@ -205,7 +232,7 @@ def retriangulate(
     Args:
         mesh: the surface.
         rng: source of all random choices.
-        triangles: approximate number of triangles of the result.
+        triangles: approximate number of triangles of the result, or its triangles, whose vertices are then slid only.
         split: whether to split all triangles; False splits only as far as necessary, which is four times faster if the
             result has fewer triangles than the mesh.
 
@@ -214,6 +241,9 @@ def retriangulate(
     """
     original = np.asarray(mesh.vertices)
     faces = faces_of(mesh).astype(np.int64)
+    if isinstance(triangles, Retriangulation):
+        vertices = (original[triangles.corners] * triangles.weights[:, :, None]).sum(axis=1)
+        return _slide(original, faces, vertices, triangles.faces, 0.2, rng), triangles.faces
     fine_vertices, fine_faces = original, faces
     while len(fine_faces) < 1.5 * triangles or (split and fine_faces is faces):
         fine_vertices, fine_faces = remesh.split(fine_vertices, fine_faces, mesh.name)
@@ -263,8 +293,6 @@ def _merge(parts: Sequence[tuple[FloatArray, LongArray]]) -> tuple[FloatArray, L
 
 
 # Simulated hair and collars on a scan, which no face model represents
-
-LongArray: TypeAlias = npt.NDArray[np.int64]
 
 _UP, _FRONT = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
 

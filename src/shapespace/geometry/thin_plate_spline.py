@@ -7,13 +7,16 @@ Equations Mn are those of docs/morphometrics.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.interpolate import RBFInterpolator
 from scipy.spatial.distance import cdist, pdist
 
 from shapespace.errors import InputError
 from shapespace.types import FloatArray, read_only
+
+if TYPE_CHECKING:
+    from scipy.interpolate import RBFInterpolator
 
 _RANK = 1e-9  # ratio of singular values; landmarks nearer to a line or a plane than rounding determine no affine map
 _SAME = 1e-12  # of the size; landmarks nearer to each other coincide up to float64 rounding
@@ -50,6 +53,8 @@ class ThinPlateSpline:
             raise InputError(
                 f"A thin-plate spline needs {D + 1} or more different landmarks that do not lie on {place}."
             )
+        from scipy.interpolate import RBFInterpolator  # slow to import, and most commands need no spline
+
         kernel = "linear" if D == 3 else "thin_plate_spline"
         return ThinPlateSpline(read_only(centre), size, RBFInterpolator(x, target, kernel=kernel, degree=1))  # M8
 

@@ -20,7 +20,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
-from scipy.optimize import isotonic_regression
 
 from shapespace.model.krylov import largest_eigenpairs
 from shapespace.types import FloatArray
@@ -66,6 +65,8 @@ def variances_of_new_shapes(
         n_shapes: number of shapes of the sample.
         held_out: variances of held-out shapes along K modes; None if only the spectrum is known: K is then its length.
     """
+    from scipy.optimize import isotonic_regression  # slow to import, and readers of models do not need it
+
     count = len(sample) if held_out is None else len(held_out.squares)
     spectrum = whole_spectrum(sample, total, n_shapes)
     # If shapes are not independent, a single prediction can be absurd, which its neighbours then correct.

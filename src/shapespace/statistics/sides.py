@@ -31,6 +31,8 @@ _FEWEST = 4  # vertices, two pairs: one pair leaves the plane of symmetry to cha
 _MIRROR_IMAGE = 0.5
 """The two sides are mirror images if reflection reduces the distance of their means to this share or below."""
 _NUMBER = re.compile(r"[0-9]{1,12}")
+_SIDE = re.compile(r"(?<![a-z])(?:left|right|l|r)(?![a-z])")
+_OTHER_SIDE = {"left": "right", "right": "left", "l": "r", "r": "l"}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -319,6 +321,17 @@ def read_pairs(path: Path, cohort: Cohort) -> tuple[tuple[int, int], ...]:
         raise InputError(f"{path}: no {kind} has the name or number {list_names(unknown)} (landmarks: {there}).")
     pairs = [tuple(landmarks[cell] if cell in landmarks else int(cell) - first for cell in row) for row in rows]
     return tuple((a, b) for a, b in pairs)
+
+
+def pairs_by_name(names: Sequence[str]) -> tuple[tuple[str, str], ...]:
+    """Return the pairs of landmarks whose names differ only in their side: left and right, or l and r, as words.
+
+    Args:
+        names: names of landmarks, such as `left arch`, `arch_R` or `L3`.
+    """
+    folded = {name.casefold(): name for name in names}
+    others = {name: folded.get(_SIDE.sub(lambda side: _OTHER_SIDE[side[0]], key)) for key, name in folded.items()}
+    return tuple((a, b) for a, b in others.items() if b is not None and names.index(a) < names.index(b))
 
 
 def _paired_sides(vertices: IntArray, faces: IntArray | None, partner: IntArray, **known: Any) -> Sides:

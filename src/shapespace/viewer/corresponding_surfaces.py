@@ -78,7 +78,8 @@ class Surfaces:
         }
 
     def packed_mean(self) -> bytes:
-        """Return the mean shape, upright, its checkerboard, and the triangles that are drawn."""
+        """Return the mean shape, upright, its checkerboard, the triangles drawn, and its rotation from the frame
+        of the folder."""
         with self._lock:
             if self._packed_mean is None:
                 self._packed_mean = self._pack_mean()
@@ -96,7 +97,7 @@ class Surfaces:
             "draft": np.asarray(kept[kept_turning][faces_of(turning)], dtype=np.uint32),
             "places": np.stack([along, across], axis=1),
         }
-        return pack(arrays, {})
+        return pack(arrays, {"turn": self._corresponded.turn.tolist()})
 
     def packed_population(self) -> bytes:
         """Return the number of scans that show each vertex, and the RMS standard deviation of its position along the

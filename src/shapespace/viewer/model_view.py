@@ -212,10 +212,8 @@ class ModelView:
             "reason": self.public(_reason_with_name(fit)),
             "pictured": pictured,
             "why_not": why_not,
-            "fitted": fit.entry.fitted is not None and fit.fitted,
             "z": [float(f"{value:.{_DIGITS}g}") for value in z] or None,
             "shown": to_json(fit.record.shown),
-            "model_to_scan_mm": _number(fit.summary_mm("final", "model_to_scan", "mean")),
             "scan_to_model_mm": _number(fit.summary_mm("final", "scan_to_model", "mean")),
             "expected_error_mm": _number(fit.expected_error_mm),
         }

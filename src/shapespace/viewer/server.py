@@ -56,8 +56,6 @@ def _about(view: ModelView, request: Request) -> Response:
             "modes_sent": view.n_modes_sent,
             "stddev": model.stddev.tolist(),
             "vertices": model.n_vertices,
-            "triangles": 0 if model.faces is None else len(model.faces),
-            "landmarks": list(model.landmarks),
             "has_fits": view.folder is not None,
             "exports": [kind for kind in EXPORTS if model.faces is not None or kind != "stl"],
         }

@@ -21,7 +21,7 @@ NO_SLIDERS = np.zeros((0, 3), dtype=np.int32)
 _NO_POINTS = np.zeros(0, dtype=np.int32)
 Curve: TypeAlias = tuple[tuple[int, ...], bool]
 """Indices of the points along a curve, from 0, and whether it is closed (the first point follows the last)."""
-_MOST_CURVE_POINTS = 100
+MOST_CURVE_POINTS = 100
 """Default number of points of a resampled curve; the RMS distance of its lines from the original is at most 0.4 % of
 the size, measured on 99 sections of femora and spleens."""
 _MOST_DIGITS = 9  # digits of the number of a landmark, which fits 32 bits
@@ -143,7 +143,7 @@ def equal_curves(
         # The last point of a contour is often equal to its first point.
         own = [curve[:-1] if closed and len(curve) > 1 and (curve[0] == curve[-1]).all() else curve for curve in own]
         numbers = sorted(set(map(len, own)))
-        points = count or min(numbers[0], _MOST_CURVE_POINTS)
+        points = count or min(numbers[0], MOST_CURVE_POINTS)
         if count or len(numbers) > 1 or (closed and points < numbers[0]):
             known = [curve[~np.isnan(curve).any(axis=1)] for curve in own]
             for name, curve, seen in zip(names, own, known, strict=True):
@@ -152,7 +152,7 @@ def equal_curves(
                         f"Cannot read {path}: curve {place} of specimen {name[:60]!r} has one point or none, and "
                         f"{numbers[-1]} in another; digitise the same curves for all."
                     )
-            own = [_resample_polyline(seen, points, closed) if len(seen) else curve[:1].repeat(points, 0)
+            own = [resample_polyline(seen, points, closed) if len(seen) else curve[:1].repeat(points, 0)
                    for curve, seen in zip(own, known, strict=True)]  # fmt: skip
             had = " to ".join(map(str, dict.fromkeys((numbers[0], numbers[-1]))))
             kind = "Closed curve" if closed else "Curve"
@@ -162,7 +162,7 @@ def equal_curves(
     return out, tuple(notes)
 
 
-def _resample_polyline(path: FloatArray, count: int, closed: bool) -> FloatArray:
+def resample_polyline(path: FloatArray, count: int, closed: bool) -> FloatArray:
     """Return `count` points of a polyline at equal distances from its first point, including the end of an open one."""
     return spaced_points(np.concatenate([path, path[:1]]), count + 1)[:-1] if closed else spaced_points(path, count)
 

@@ -14,9 +14,11 @@
       this.home = null; // the state that a reset goes back to
     }
 
-    turn(yaw, pitch) {
-      this.state.yaw += yaw;
-      this.state.pitch = Math.min(Math.max(this.state.pitch + pitch, -Math.PI / 2), Math.PI / 2);
+    /** Turn by angles across and along the picture, which the roll rotates. */
+    turn(across, along) {
+      const { pitch, roll } = this.state;
+      this.state.yaw += Math.cos(roll) * across - Math.sin(roll) * along;
+      this.state.pitch = Math.min(Math.max(pitch + Math.sin(roll) * across + Math.cos(roll) * along, -Math.PI / 2), Math.PI / 2);
     }
 
     zoom(factor) {

@@ -83,7 +83,6 @@
   Shapespace.Model = class {
     constructor(unpacked) {
       const { mean, faces, modes } = unpacked.arrays;
-      this.facts = unpacked.facts;
       this.mean = mean;
       this.faces = faces && faces.length ? faces : null;
       this.V = mean.length / 3;

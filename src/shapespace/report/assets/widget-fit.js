@@ -3,143 +3,177 @@
   "use strict";
 
   const Shapespace = window.Shapespace;
-  const { colours, make, slider, tick, select, choice, swatches, lazily, stage } = Shapespace.widgetParts;
+  const parts = Shapespace.widgetParts;
+  const { colours, make, dot, slider, tick, choice, percent, staged } = parts;
 
-  const STAGES = { before: "Before", initial: "Phase 1", final: "Phase 2", dense: "Dense" };
-  const REGIONS = ["followed", "rejected", "border", "unseen"];
-  const REGION_WORDS = {
-    followed: "follows the scan", rejected: "does not match", border: "at the scan\u2019s border", unseen: "not shown by the scan",
+  const STAGES = {
+    before: ["Before", "Before: centroids together"], initial: ["Phase 1", "After phase 1: the pose"], final: ["Phase 2", "After phase 2: pose and shape"],
+    dense: ["Dense", "Dense: the rest of the way to the scan"],
   };
+  const REGIONS = { followed: "follows the scan", rejected: "does not match", border: "at the scan\u2019s border", unseen: "not shown by the scan" };
+  // The surfaces that are shown in each colouring where both are overlaid.
+  const SHOWN = { plain: ["scan", "model"], model: ["model"], scan: ["scan"], regions: ["model"], colour: ["model"] };
 
-  /** A scan and the model that was fitted to it: stages, opacity, distances, regions. */
-  Shapespace.widgets.fit = (element, payload) =>
-    lazily(element, payload, (unpacked) => {
-      const { facts, arrays } = unpacked;
-      const { view, controls } = stage(element, `Scan and fitted model of ${facts.label || facts.name}`);
-      const stages = facts.stages;
-      // How far the fit lies from the scan is what one looks for first.
-      const state = { stage: "final", map: arrays.scan ? "model" : "none", threshold: null };
-      if (arrays.scan) {
-        const scanShown = { positions: arrays.scan, faces: arrays.scan_faces || null, colour: colours().scan };
-        view.setSurface("scan", { ...scanShown, opacity: 0.5, visible: false });
-      }
-      view.setSurface("model", {
-        positions: arrays[`surface_${state.stage}`], faces: arrays.faces || null, colour: colours().model,
-      });
-      view.frame(["model"], 1.12);
+  /**
+   * A scan and the model that was fitted to it: stages, layout, colours, opacities, threshold.
+   * wanted: {layout, colour} to begin with; onchange(state): it is drawn anew.
+   */
+  parts.fit = function ({ facts, arrays }, { stage, controls, wanted, onchange = () => {} }) {
+    const { stages } = facts, limit = facts.scale_mm > 0 ? facts.scale_mm : 1;
+    const colourings = [["plain", "Plain"]];
+    if (arrays.scan) colourings.push(["model", "Model to scan"], ["scan", "Scan to model"]);
+    if (arrays.regions) colourings.push(["regions", "Regions"]);
+    if (arrays.colours_final && arrays.scan_colours) colourings.push(["colour", "Colour of the scan"]);
+    const state = {
+      stage: "final",
+      moment: null, // {positions, caption} in place of a stage
+      layout: arrays.scan ? wanted.layout : "overlay",
+      colour: colourings.some(([key]) => key === wanted.colour) ? wanted.colour : "plain",
+      marked: false,
+      threshold: Math.min(limit / 2, 2),
+    };
+    const said = make("p", { class: "ss-said", "aria-live": "polite", "data-testid": "fit-share" });
+    const nameOf = (name, long) => (name !== "final" || stages.includes("initial") ? STAGES[name][long] : long ? "The fitted model" : "Fitted");
+    const isSide = () => state.layout === "side";
+    const distances = () => (state.colour === "model" ? arrays[`model_to_scan_${state.stage}`] : state.colour === "scan" ? arrays[`scan_to_model_${state.stage}`] : null);
 
-      const bar = make("div", { class: "ss-bar" }), legend = make("div", { class: "ss-bar" });
-      legend.append(swatches(REGIONS.map((name) => [REGION_WORDS[name], colours().regions[name]])));
-      const announcement = make("p", { class: "ss-said", "aria-live": "polite" });
+    function draw() {
+      stage.split(isSide());
+      const view = isSide() ? stage.b : stage.a, other = isSide() ? stage.a : stage.b;
+      const positions = state.moment ? state.moment.positions : arrays[`surface_${state.stage}`];
+      if (stage.take(draw) && arrays.scan) stage.a.setSurface("scan", { positions: arrays.scan, faces: arrays.scan_faces || null, colour: colours().scan });
+      if (other) other.remove("model");
+      if (view.has("model")) view.move("model", positions);
+      else view.setSurface("model", { positions, faces: arrays.faces || null, colour: colours().model });
+      if (scan) stage.a.set("scan", scan.shown());
+      view.set("model", model.shown());
+      paint(view);
+      const when = state.moment ? state.moment.caption : nameOf(state.stage, 1), label = facts.label || facts.name;
+      if (isSide()) stage.captions(`${label}: the scan`, when);
+      else stage.captions(`${label}. ${when}`);
+      for (const [row, value] of [[stageRow, state.moment ? null : state.stage], [layoutRow, state.layout], [colourRow, state.colour]]) if (row) row.put(value);
+      onchange(state);
+    }
 
-      const values = () =>
-        state.map === "model" ? arrays[`model_to_scan_${state.stage}`]
-          : state.map === "scan" ? arrays[`scan_to_model_${state.stage}`] : null;
+    function frame() {
+      stage.a.frame(undefined, 1.12);
+      if (isSide()) stage.a.link(stage.b);
+    }
 
-      function paint() {
-        const distances = state.map === "model" || state.map === "scan";
-        const scale = distances ? Shapespace.distanceScale(facts, values(), state.map === "model", colours()) : {};
-        const { signal, unknown } = colours();
-        const map = { map: scale.map, range: scale.range, threshold: state.threshold, signal, unknown };
-        if (distances) {
-          const beyond = state.threshold === null ? [] : [[`beyond ${state.threshold.toFixed(1)} mm`, signal]];
-          Shapespace.colourBar(bar, { ...scale, keys: [...beyond, ...scale.keys] });
-        }
-        if (arrays.scan) view.paint("scan", state.map === "scan" ? values() : null, map);
-        if (state.map === "colour") {
-          view.paint("scan", arrays.scan_colours, { rgb: true });
-          view.paint("model", arrays[`colours_${state.stage}`] || arrays.colours_final, { rgb: true });
-        } else if (state.map === "regions") {
-          view.paint("model", arrays.regions, { categories: REGIONS.map((name) => colours().regions[name]) });
-        } else {
-          view.paint("model", state.map === "model" ? values() : null, map);
-        }
-        bar.hidden = limit.hidden = !distances;
-        beyond.row.hidden = !distances || state.threshold === null;
-        legend.hidden = state.map !== "regions";
-        announcement.textContent = distances ? sentence() : state.map === "regions" ? regions() : state.map === "colour" ? "Grey: vertices where the fit does not follow the scan." : facts.without_scan ? facts.without_scan : "Where scan and model overlap, the nearer one is shown.";
-        announcement.hidden = !announcement.textContent;
-      }
+    function paint(view) {
+      const values = distances(), { signal, unknown, regions, scan: ofScan, model: ofModel } = colours();
+      const options = { signal, unknown, threshold: state.marked ? state.threshold : null };
+      const scale = values ? Shapespace.distanceScale(facts, values, state.colour === "model", colours()) : null;
+      if (scale) Object.assign(options, { map: scale.map, range: scale.range });
+      const painted = { model: [values, options], regions: [arrays.regions, { categories: Object.keys(REGIONS).map((name) => regions[name]) }],
+        colour: [arrays[`colours_${state.stage}`] || arrays.colours_final, { rgb: true }] };
+      view.paint("model", ...(painted[state.colour] || [null]));
+      if (arrays.scan) stage.a.paint("scan", ...(state.colour === "scan" ? [values, options] : state.colour === "colour" ? [arrays.scan_colours, { rgb: true }] : [null]));
+      stage.bar(scale && { ...scale, keys: [...(state.marked ? [["beyond the threshold", signal]] : []), ...scale.keys] });
+      const both = arrays.scan && !isSide();
+      if (state.colour === "plain") stage.legend(both ? [["scan", ofScan], ["model", ofModel]] : null, "the nearer one is shown");
+      else if (state.colour === "regions") stage.legend(Object.entries(REGIONS).map(([name, text]) => [text, regions[name]]));
+      else if (state.colour === "colour") stage.legend([["the fit does not follow the scan", unknown]]);
+      else stage.legend(null);
+      mark.hidden = !values;
+      beyond.row.hidden = !values || !state.marked;
+      said.textContent = values ? sentence() : state.colour === "regions" && facts.region_shares ? shares() : "";
+      said.hidden = !said.textContent;
+    }
 
-      // Figures are of all vertices, also where fewer are drawn.
-      function sentence() {
-        const known = facts.mean_mm[state.stage][state.map];
-        if (known === null) return "No distance is known here.";
-        const mean = `Mean distance ${known.toFixed(2)} mm.`;
-        if (state.threshold === null) return mean;
-        const share = 100 * arrays[`beyond_${state.map}_${state.stage}`][Math.round(10 * state.threshold)];
-        return `${mean} ${share.toFixed(share < 9.95 ? 1 : 0)} % lie beyond ${state.threshold.toFixed(1)} mm.`;
-      }
+    // Figures are of all vertices, also where fewer are drawn.
+    function sentence() {
+      const mean = facts.mean_mm[state.stage][state.colour];
+      if (mean === null) return "No distance is known here.";
+      if (!state.marked) return `Mean distance ${mean.toFixed(2)} mm.`;
+      const shares = arrays[`beyond_${state.colour}_${state.stage}`];
+      return `Mean distance ${mean.toFixed(2)} mm. ${percent(shares[Math.round((50 * state.threshold) / limit)])} lie beyond ${state.threshold.toFixed(2)} mm.`;
+    }
 
-      function regions() {
-        const words = REGIONS.map((name, k) => `${REGION_WORDS[name]}: ${Math.round(100 * facts.region_shares[k])} %`);
-        return `${words.join("; ")}.`;
-      }
+    const shares = () => `${Object.values(REGIONS).map((text, k) => `${text}: ${Math.round(100 * facts.region_shares[k])} %`).join("; ")}.`;
 
-      const beyond = slider({
-        label: "Threshold", min: 0.2, max: 10, step: 0.1, value: Math.min(2, facts.scale_mm),
-        show: (value) => `${value.toFixed(1)} mm`,
+    /** Visibility and opacity of a surface. */
+    function layer(id, name) {
+      const row = slider({
+        label: name, min: 0, max: 100, step: 5, value: 100, show: (value) => `${value} %`, testid: `fit-${id}-opacity`,
         input: (value) => {
-          state.threshold = value;
-          paint();
+          box.checked = value > 0;
+          draw();
         },
       });
-      const limit = tick("Mark what lies beyond a threshold", false, (on) => {
-        state.threshold = on ? beyond.get() : null;
-        paint();
-      });
-      const layer = (id, name, opacity) => {
-        const row = slider({
-          label: name, min: 0, max: 100, step: 5, value: opacity, show: (value) => `${value} %`,
-          input: (value) => {
-            box.checked = value > 0;
-            view.set(id, { opacity: value / 100, visible: value > 0 });
-          },
-        });
-        const box = make("input", { type: "checkbox", "aria-label": `Show ${name.toLowerCase()}` });
-        box.checked = opacity > 0;
-        box.addEventListener("change", () => {
-          if (box.checked && row.get() === 0) row.put(100);
-          view.set(id, { visible: box.checked, opacity: row.get() / 100 });
-        });
-        const dot = make("span", { class: "ss-dot", "aria-hidden": "true" });
-        dot.style.background = `rgb(${colours()[id].map((c) => Math.round(255 * c)).join(",")})`;
-        row.row.classList.add("ss-layer");
-        row.row.prepend(box, dot);
-        return { row: row.row, show: (percent) => {
-          row.put(percent);
-          box.checked = percent > 0;
-          view.set(id, { visible: percent > 0, opacity: percent / 100 });
-        } };
+      const box = make("input", { type: "checkbox", "aria-label": `Show ${name.toLowerCase()}`, onchange: () => {
+        if (box.checked && row.get() === 0) row.put(100);
+        draw();
+      } });
+      row.row.classList.add("ss-layer");
+      row.row.prepend(box, dot(colours()[id]));
+      return {
+        row: row.row,
+        shown: () => ({ visible: box.checked, opacity: row.get() / 100 }),
+        put: (isShown) => {
+          row.put(isShown ? 100 : 0);
+          box.checked = isShown;
+        },
       };
-      const scan = arrays.scan ? layer("scan", "Scan", 0) : null, model = layer("model", "Model", 100);
-      const maps = [["none", "plain"]];
-      if (arrays.scan) maps.push(["model", "distance, model to scan"], ["scan", "distance, scan to model"]);
-      if (arrays.regions) maps.push(["regions", "regions that the fit used"]);
-      if (arrays.colours_final && arrays.scan_colours) maps.push(["colour", "colour of the scan"]);
-      const called = (name) => (name === "final" && !stages.includes("initial") ? "Fitted" : STAGES[name] || name);
-      if (stages.length > 1) {
-        controls.append(choice("Stage", stages.map((name) => [name, called(name)]), state.stage, (name) => {
-          state.stage = name;
-          view.move("model", arrays[`surface_${name}`]);
-          paint();
-        }));
-      }
-      controls.append(
-        make("div", { class: "ss-sliders", role: "group", "aria-label": "Visibility and opacity" }, ...[scan && scan.row, model.row].filter(Boolean)),
-        select("Colour", maps, state.map, (key) => {
-          state.map = key;
-          // The coloured surface is seen alone; the sliders bring the other one back.
-          if (scan) scan.show(key === "scan" || key === "none" ? 100 : 0);
-          model.show(key === "scan" ? 0 : 100);
-          paint();
-        }).row,
-        bar, legend, limit, beyond.row, announcement
-      );
-      if (facts.thinned) {
-        controls.append(make("p", { class: "ss-hint", text: "Drawn with fewer triangles than there are; the numbers are of all." }));
-      }
-      paint();
-      return { view, state };
+    }
+    const scan = arrays.scan ? layer("scan", "Scan") : null, model = layer("model", "Model");
+    const putLayers = () => {
+      for (const [id, row] of [["scan", scan], ["model", model]]) if (row) row.put(isSide() || SHOWN[state.colour].includes(id));
+    };
+    const stageRow = stages.length > 1 ? choice("Stage", stages.map((name) => [name, nameOf(name, 0)]), null, (name) => {
+      Object.assign(state, { stage: name, moment: null });
+      draw();
+    }, "fit-stage") : null;
+    const layoutRow = scan ? choice("Layout", [["overlay", "Overlaid"], ["side", "Side by side"]], null, (layout) => {
+      state.layout = layout;
+      putLayers();
+      draw();
+    }, "fit-layout") : null;
+    const colourRow = choice("Colour", colourings, null, (colour) => {
+      if (state.moment) Object.assign(state, { stage: "final", moment: null });
+      state.colour = colour;
+      putLayers();
+      draw();
+    }, "fit-colour");
+    const mark = tick("Mark what lies beyond a threshold", false, (on) => {
+      state.marked = on;
+      draw();
+    }, "fit-mark");
+    const beyond = slider({
+      label: "Threshold", min: 0, max: 2 * limit, step: limit / 50, value: state.threshold, show: (value) => `${value.toFixed(2)} mm`, testid: "fit-threshold",
+      input: (value) => {
+        state.threshold = value;
+        draw();
+      },
     });
+    state.threshold = beyond.get();
+    controls.append(
+      ...(facts.without_scan ? [make("p", { text: facts.without_scan, "data-testid": "fit-without-scan" })] : []), ...[stageRow, layoutRow, colourRow].filter(Boolean).map(({ row }) => row), mark, beyond.row, said,
+      make("div", { class: "ss-sliders", role: "group", "aria-label": "Visibility and opacity" }, scan && scan.row, model.row)
+    );
+    if (facts.thinned) controls.append(make("p", { class: "ss-hint", text: "Drawn with fewer triangles than there are; the numbers are of all." }));
+    putLayers();
+    draw();
+    frame();
+    return {
+      state,
+      draw,
+      frame,
+      /** Show {positions, caption} of an iteration in place of a stage. */
+      showMoment(moment) {
+        state.moment = moment;
+        if (state.colour !== "plain") {
+          state.colour = "plain";
+          putLayers();
+        }
+        draw();
+      },
+    };
+  };
+
+  Shapespace.widgets.fit = staged((unpacked, options) => {
+    options.stage.a.label = `Scan and fitted model of ${unpacked.facts.label || unpacked.facts.name}`;
+    // How far the fit lies from the scan is what one looks for first.
+    return parts.fit(unpacked, { ...options, wanted: { layout: "overlay", colour: "model" } });
+  });
 })();

@@ -3,159 +3,173 @@
   "use strict";
 
   const Shapespace = window.Shapespace;
-  const {
-    colours, make, signed, slider, button, animation, tick, select, niceCeiling, quantile, lazily, stage,
-  } = Shapespace.widgetParts;
+  const parts = Shapespace.widgetParts;
+  const { make, signed, percent, slider, button, animation, swing, tick, niceCeiling, quantile, displacementScale, staged } = parts;
 
-  /** Sliders that move a shape model along its modes. */
-  Shapespace.widgets.modes = (element, payload, options) =>
-    lazily(element, payload, (unpacked) => {
-      const { most = 8, reach = 3 } = options || {};
-      const model = new Shapespace.Model(unpacked);
-      const { view, controls } = stage(element, "The shape at the coefficients of the sliders");
-      const K = Math.min(most, model.K);
-      const z = new Float32Array(model.K), positions = new Float32Array(3 * model.V);
-      view.setSurface("shape", { positions: model.vertices(z), faces: model.faces, colour: colours().clay });
-      view.frame();
+  const REACH = 3; // standard deviations
+  const SHOWN_AT_FIRST = 12; // modes
 
-      let coloured = false, top = 0;
-      const bar = make("div", { class: "ss-bar", hidden: true });
-      const draw = () => {
-        view.move("shape", model.vertices(z, positions));
-        if (coloured) paint();
-      };
-      const paint = () =>
-        view.paint("shape", model.displacement(z), { map: model.faces ? colours().diverging : colours().sequential,
-          range: [model.faces ? -top : 0, top] });
+  /** A number from the standard normal distribution, by Box and Muller. */
+  const normal = () => Math.sqrt(-2 * Math.log(1 - Math.random())) * Math.cos(2 * Math.PI * Math.random());
+  parts.randomShape = (count) => Array.from({ length: count }, () => Math.max(-REACH, Math.min(REACH, normal())));
 
-      const share = unpacked.arrays.share;
-      const rows = [];
-      for (let k = 0; k < K; k++) {
-        const percent = share ? 100 * share[k] : NaN;
-        rows.push(slider({
-          label: `Mode ${k + 1}`, min: -reach, max: reach, step: 0.1, value: 0,
-          note: Number.isFinite(percent) ? `${percent.toFixed(percent < 9.95 ? 1 : 0)} %` : "",
-          show: (value) => `${signed(value, 1)} sd`,
-          input: (value) => {
-            stop();
-            z[k] = value;
-            draw();
-          },
-        }));
-      }
-      const put = (values) => {
-        for (let k = 0; k < z.length; k++) z[k] = values(k);
-        rows.forEach((row, k) => row.put(z[k]));
-        draw();
-      };
-      const which = select("Mode to animate", rows.map((_, k) => [String(k), `Mode ${k + 1}`]), "0", () => restart());
-      which.row.classList.add("ss-inline");
-      const { toggle, stop, restart } = animation(element, reach, () => {
-        const k = Number(which.list.value);
-        return { value: z[k], put: (value) => {
-          z[k] = value;
-          rows[k].put(z[k]);
-          draw();
-        } };
-      });
+  /** Position of a landmark: `at` has the vertices of its triangle and their barycentric weights. */
+  const onSurface = (positions, at) => [0, 1, 2].map((axis) => at.vertices.reduce((sum, v, k) => sum + at.weights[k] * positions[3 * v + axis], 0));
 
-      controls.append(
-        make("div", { class: "ss-sliders", role: "group", "aria-label": "Modes, in standard deviations" },
-          ...rows.map((row) => row.row)),
-        make("div", { class: "ss-buttons" },
-          button("Reset", () => { stop(); put(() => 0); }),
-          button("Random", () => { stop(); put(() => Math.max(-reach, Math.min(reach, normal()))); })),
-        make("div", { class: "ss-buttons" }, toggle, which.row),
-        tick("Colour by distance from the mean", false, (on) => {
-          coloured = on;
-          if (on && !top) {
-            const one = new Float32Array(model.K);
-            let most = 0;
-            for (let k = 0; k < Math.min(3, model.K); k++) {
-              one.fill(0);
-              one[k] = reach;
-              most = Math.max(most, quantile(model.displacement(one), 0.95) || 0);
-            }
-            top = niceCeiling(most);
-            Shapespace.colourBar(bar, {
-              map: model.faces ? colours().diverging : colours().sequential, range: [model.faces ? -top : 0, top],
-              unit: "mm", title: model.faces ? "Moved inwards (\u2212) or outwards (+)" : "Moved", open: true,
-            });
-          }
-          bar.hidden = !on;
-          if (on) paint();
-          else view.paint("shape", null);
-        }),
-        bar
-      );
-      return { view, model, z, draw };
-    });
+  /** Sliders that move `model` along its modes; z: the coefficients, standard deviations; onchange(): they were changed by hand. */
+  parts.modes = function ({ facts, arrays }, { stage, controls, model, z, onchange = () => {} }) {
+    let positions, top = 0;
+    const on = { map: false, landmarks: false };
+    const draw = () => {
+      positions = model.vertices(z, positions);
+      stage.show(draw, { positions, faces: model.faces });
+      stage.captions(z.some((value) => value) ? "" : "The mean shape");
+      const moved = on.map ? model.displacement(z) : null, most = moved ? quantile(moved, 0.98) : 0;
+      if (moved && (most > top || most < top / 4)) top = niceCeiling(most);
+      stage.paint(moved, displacementScale(model, top, "from the mean"));
+      const marks = on.landmarks ? Object.entries(facts.landmarks) : [];
+      stage.a.marks("landmarks", marks.map(([label, at]) => ({ position: onSurface(positions, at), label })));
+    };
+    const act = (change) => () => {
+      stop();
+      change();
+      draw();
+      onchange();
+    };
 
-  /** A slider that moves one shape to another. */
-  Shapespace.widgets.morph = (element, payload) =>
-    lazily(element, payload, (unpacked) => {
-      const model = new Shapespace.Model(unpacked), { low, high, weights, variable, range } = unpacked.facts;
-      const { view, controls } = stage(element, `A shape between ${low} and ${high}, at the value of the slider`);
-      const at = new Float32Array(weights[0]), positions = new Float32Array(3 * model.V);
-      let now = -1;
-      /** Sets the shape at a value from -1 to 1. */
-      const move = (value) => {
-        now = value;
-        const place = (value + 1) / 2 * (weights.length - 1), before = Math.min(Math.floor(place), weights.length - 2);
-        for (let k = 0; k < at.length; k++) {
-          at[k] = weights[before][k] + (place - before) * (weights[before + 1][k] - weights[before][k]);
-        }
-        draw();
-      };
-      view.setSurface("shape", { positions: model.vertices(at), faces: model.faces, colour: colours().clay });
-      view.frame();
-      const bar = make("div", { class: "ss-bar", hidden: true });
-      const draw = () => view.move("shape", model.vertices(at, positions));
-      const words = (value) => {
-        if (variable) return `${variable} ${Number((range[0] + (value + 1) / 2 * (range[1] - range[0])).toPrecision(3))}`;
-        return value <= -1 ? low : value >= 1 ? high : `${Math.round(50 + 50 * value)} % of the way`;
-      };
+    const ticks = [];
+    const rows = Array.from({ length: model.K }, (_, k) => {
+      const number = k + 1, share = arrays.share[k];
       const row = slider({
-        label: `${low} to ${high}`, min: -1, max: 1, step: 0.02, value: -1, show: words,
-        input: (value) => {
-          stop();
-          move(value);
-        },
+        label: `${number} `, name: `Mode ${number}, standard deviations`, note: Number.isFinite(share) ? percent(share) : "", testid: `mode-${number}`,
+        min: -REACH, max: REACH, step: 0.05, value: z[k], origin: 0, show: (value) => signed(value, 2),
+        input: (value) => act(() => set(k, value))(),
       });
-      row.row.classList.add("ss-wide");
-      const { toggle, stop } = animation(element, 1, () => ({ value: now, put: (value) => {
-        row.put(value);
-        move(value);
-      } }));
-      const map = model.faces ? colours().diverging : colours().sequential;
-      let change = null, top = 0;
-      const put = (value) => {
-        stop();
-        row.put(value);
-        move(value);
-      };
-      controls.append(
-        make("div", { class: "ss-sliders", role: "group", "aria-label": "Between the two shapes" }, row.row),
-        make("div", { class: "ss-buttons" }, button(low, () => put(-1)), button(high, () => put(1)), toggle),
-        tick("Colour by how far it moves", false, (on) => {
-          if (on && !change) {
-            change = model.displacement(weights[weights.length - 1].map((value, k) => value - weights[0][k]));
-            top = niceCeiling(quantile(change, 0.98));
-            Shapespace.colourBar(bar, {
-              map, range: [model.faces ? -top : 0, top], unit: "mm", open: true,
-              title: model.faces ? "Inwards (\u2212) or outwards (+), from one end to the other" : "Moved",
-            });
-          }
-          bar.hidden = !on;
-          view.paint("shape", on ? change : null, { map, range: [model.faces ? -top : 0, top] });
-        }),
-        bar
-      );
-      return { view, model, at, draw };
+      row.undo = button("\u00d7", act(() => set(k, 0)), { class: "ss-undo", "aria-label": `Set mode ${number} back to zero`, title: "Back to zero", "data-testid": `reset-${number}` });
+      row.output.dataset.testid = `value-${number}`;
+      ticks.push(make("input", {
+        type: "checkbox", "aria-label": `Animate mode ${number}`, title: `Animate mode ${number}`, "data-testid": `animate-${number}`,
+        onchange: () => { toggle.disabled = !ticks.some((box) => box.checked); },
+      }));
+      row.row.classList.add("ss-mode");
+      row.row.prepend(ticks[k]);
+      row.row.append(row.undo);
+      row.row.hidden = k >= SHOWN_AT_FIRST;
+      return row;
     });
+    ticks[0].checked = true;
+    const set = (k, value) => {
+      z[k] = value;
+      rows[k].put(value);
+      rows[k].undo.disabled = value === 0;
+    };
+    const setShape = (values) => {
+      for (let k = 0; k < z.length; k++) z[k] = values[k] || 0;
+      rows.forEach((_, k) => set(k, z[k]));
+    };
+    const { toggle, stop } = animation(controls, () => {
+      const chosen = ticks.flatMap((box, k) => (box.checked ? [k] : []));
+      // One mode swings all the way; several together stay where shapes are likely.
+      const reach = chosen.length === 1 ? REACH : Math.max(1, REACH / Math.sqrt(chosen.length));
+      const swings = chosen.map((k, j) => swing(z[k], reach, 4 + 0.7 * j));
+      return (seconds) => {
+        chosen.forEach((k, j) => set(k, swings[j](seconds)));
+        draw();
+      };
+    }, "Animate", "animate");
+    const option = (key, text) => tick(text, false, (checked) => {
+      on[key] = checked;
+      draw();
+    }, key);
+    const rest = model.K - SHOWN_AT_FIRST;
+    const more = rest > 0 ? button(`Show ${rest} more modes`, () => {
+      rows.forEach(({ row }) => { row.hidden = false; });
+      more.remove();
+      rows[SHOWN_AT_FIRST].range.focus();
+    }, { "data-testid": "more-modes" }) : null;
+    controls.append(
+      make("div", { class: "ss-buttons" },
+        button("Mean shape", act(() => setShape([])), { "data-testid": "reset-all" }),
+        button("Random shape", act(() => setShape(parts.randomShape(z.length))), { "data-testid": "random" }), toggle),
+      make("p", { class: "ss-hint", text: "Each slider is one mode with its share of the variance, in standard deviations. Animate swings the modes that are ticked." }),
+      make("div", { class: "ss-buttons" }, option("map", "Colour by distance from the mean"), Object.keys(facts.landmarks).length ? option("landmarks", "Landmarks") : null),
+      make("div", { class: "ss-sliders", role: "group", "aria-label": "Modes, in standard deviations", "data-testid": "sliders" }, ...rows.map(({ row }) => row), more)
+    );
+    setShape(z);
+    return { z, draw, stop, setShape };
+  };
 
-  /** A number from the standard normal distribution. */
-  function normal() {
-    return Math.sqrt(-2 * Math.log(1 - Math.random())) * Math.cos(2 * Math.PI * Math.random());
-  }
+  Shapespace.widgets.modes = staged((unpacked, options) => {
+    const model = new Shapespace.Model(unpacked), made = parts.modes(unpacked, { ...options, model, z: new Float64Array(model.K) });
+    options.stage.a.label = "The shape at the coefficients of the sliders";
+    made.draw();
+    options.stage.a.frame();
+    return made;
+  });
+
+  /**
+   * A slider from one shape to another. at(value): the coefficients at a value from -1 to 1, words(value): its name;
+   * ends: texts of the buttons of both ends, label: of the slider.
+   */
+  parts.morph = function (model, { stage, controls, at, words, ends, label }) {
+    let now = -1, positions, change = null, isColoured = false;
+    /** Draw the shape; isNew: from other ends. */
+    const draw = (isNew) => {
+      positions = model.vertices(at(now), positions);
+      stage.show(draw, { positions, faces: model.faces });
+      stage.captions(words(now));
+      if (isNew) {
+        change = null;
+        row.put(now);
+      }
+      if (isColoured && !change) {
+        const from = at(-1);
+        change = model.displacement(at(1).map((value, k) => value - from[k]));
+      }
+      const top = change ? niceCeiling(quantile(change, 0.98)) : 0;
+      stage.paint(isColoured ? change : null, displacementScale(model, top, "from one end to the other"));
+    };
+    const move = (value) => {
+      now = value;
+      row.put(value);
+      draw();
+    };
+    const put = (value) => {
+      stop();
+      move(value);
+    };
+    const row = slider({ label, min: -1, max: 1, step: 0.01, value: -1, show: words, testid: "walk", input: put });
+    row.row.classList.add("ss-wide");
+    const { toggle, stop } = animation(controls, () => {
+      const way = swing(now, 1);
+      return (seconds) => move(way(seconds));
+    }, "Animate", "walk-play");
+    controls.append(
+      make("div", { class: "ss-sliders", role: "group", "aria-label": "Between the two shapes" }, row.row),
+      make("div", { class: "ss-buttons" }, ...ends.map((text, k) => button(text, () => put(2 * k - 1))), toggle),
+      tick("Colour by how far it moves", false, (on) => {
+        isColoured = on;
+        draw();
+      }, "difference")
+    );
+    return { draw, stop, now: () => at(now) };
+  };
+
+  /** A slider that moves one shape to another, along a line or a path. */
+  Shapespace.widgets.morph = staged((unpacked, options) => {
+    const model = new Shapespace.Model(unpacked), { low, high, weights, variable, range } = unpacked.facts;
+    const at = (value) => {
+      const place = (value + 1) / 2 * (weights.length - 1), before = Math.min(Math.floor(place), weights.length - 2);
+      return weights[before].map((weight, k) => weight + (place - before) * (weights[before + 1][k] - weight));
+    };
+    const words = (value) => {
+      if (variable) return `${variable} ${Number((range[0] + (value + 1) / 2 * (range[1] - range[0])).toPrecision(3))}`;
+      return value <= -1 ? low : value >= 1 ? high : `${Math.round(50 + 50 * value)} % of the way`;
+    };
+    const made = parts.morph(model, { ...options, at, words, ends: [low, high], label: `${low} to ${high}` });
+    options.stage.a.label = `A shape between ${low} and ${high}, at the value of the slider`;
+    made.draw();
+    options.stage.a.frame();
+    return made;
+  });
 })();

@@ -3,7 +3,7 @@
   "use strict";
 
   const Shapespace = window.Shapespace;
-  const { colours, make } = Shapespace.widgetParts;
+  const { colours, make, css } = Shapespace.widgetParts;
 
   // Circle, square, triangle, diamond, triangle, plus, cross, star: as MARKERS of morphospace_figures.py.
   const MARKERS = [
@@ -12,7 +12,6 @@
     "M-1.2-.7L-.7-1.2 0-.5.7-1.2 1.2-.7.5 0 1.2.7.7 1.2 0 .5-.7 1.2-1.2.7-.5 0Z",
     "M0-1.4L.4-.5 1.4-.4.65.25.85 1.2 0 .7-.85 1.2-.65.25-1.4-.4-.4-.5Z",
   ];
-  const css = (colour, alpha = 1) => `rgb(${colour.map((c) => Math.round(255 * c)).join(" ")} / ${alpha})`;
 
   /** Corners of the convex hull of points [[x, y], ...], by Andrew's monotone chain. */
   function hullOf(points) {
@@ -89,5 +88,5 @@
     } };
   }
 
-  Object.assign(Shapespace.widgetParts, { MARKERS, css, hullOf, ellipseOf, isInside, cleared, shapePicture });
+  Object.assign(Shapespace.widgetParts, { MARKERS, hullOf, ellipseOf, isInside, cleared, shapePicture });
 })();

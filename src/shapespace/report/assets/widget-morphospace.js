@@ -4,13 +4,13 @@
 
   const Shapespace = window.Shapespace;
   const {
-    colours, make, signed, button, tick, select, niceCeiling, quantile, lazily,
-    MARKERS, css, hullOf, ellipseOf, isInside, cleared, shapePicture,
+    colours, make, signed, css, button, tick, select, niceCeiling, quantile, displacementScale, widget,
+    MARKERS, hullOf, ellipseOf, isInside, cleared, shapePicture,
   } = Shapespace.widgetParts;
 
   /** Shapes as points in the plane of two axes of an ordination; the shape at the marker is drawn next to the mean. */
-  Shapespace.widgets.morphospace = (element, payload) =>
-    lazily(element, payload, (unpacked) => {
+  Shapespace.widgets.morphospace =
+    widget((unpacked, element) => {
       const { facts, arrays } = unpacked, { names, groups, labels } = facts, n = names.length, K = facts.axes.length;
       const model = new Shapespace.Model(unpacked), positions = new Float32Array(model.mean.length);
       const axes = Array.from(facts.first), place = new Float32Array(K), hidden = new Set();
@@ -122,9 +122,9 @@
         bar.hidden = !shown.coloured;
         if (!shown.coloured) return picture.view.paint("shape", null);
         const moved = model.displacement(place), end = niceCeiling(quantile(moved, 0.98));
-        const scale = { map: model.faces ? colours().diverging : colours().sequential, range: [model.faces ? -end : 0, end] };
-        picture.view.paint("shape", moved, scale);
-        Shapespace.colourBar(bar, { ...scale, unit: facts.unit, open: true, title: model.faces ? "Inwards (\u2212) or outwards (+) from the mean" : "Moved from the mean" });
+        const scale = displacementScale(model, end, "from the mean", facts.unit);
+        picture.view.paint("shape", moved, { map: scale.map, range: scale.range });
+        Shapespace.colourBar(bar, scale);
       }
 
       // The marker

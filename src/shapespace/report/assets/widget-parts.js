@@ -5,6 +5,7 @@
   const Shapespace = window.Shapespace;
   let counted = 0;
 
+  /** An element: make("button", {type: "button", onclick, text}, child, ...). */
   function make(tag, attributes, ...children) {
     const element = document.createElement(tag);
     for (const [name, value] of Object.entries(attributes || {})) {
@@ -13,38 +14,47 @@
       else if (value === true) element.setAttribute(name, "");
       else if (value !== false && value !== null && value !== undefined) element.setAttribute(name, value);
     }
-    element.append(...children);
+    element.append(...children.filter((child) => child !== null && child !== undefined));
     return element;
   }
 
   const signed = (value, digits) => (value > 0 ? "+" : value < 0 ? "\u2212" : "") + Math.abs(value).toFixed(digits);
+  const percent = (share) => `${(100 * share).toFixed(share < 0.0995 ? 1 : 0)} %`;
+  const css = (colour, alpha = 1) => `rgb(${colour.map((c) => Math.round(255 * c)).join(" ")} / ${alpha})`;
 
-  /** A labelled range input and its value. */
-  function slider({ label, note = "", min, max, step, value, show, input }) {
+  function dot(colour) {
+    const element = make("span", { class: "ss-dot", "aria-hidden": "true" });
+    element.style.background = css(colour);
+    return element;
+  }
+
+  /** A labelled range input and its value; its track is filled from `origin`; name: for screen readers. */
+  function slider({ label, name = null, note = "", min, max, step, value, origin = min, show, input, testid = null }) {
     const id = `ss-${++counted}`;
-    const output = make("output", { for: id, text: show(value) });
-    const range = make("input", { type: "range", id, min, max, step, value, "aria-valuetext": show(value) });
-    const told = () => {
-      output.textContent = show(Number(range.value));
+    const output = make("output", { for: id });
+    const range = make("input", { type: "range", id, min, max, step, value, "aria-label": name, "data-testid": testid });
+    const share = (at) => `${((100 * (at - range.min)) / (range.max - range.min || 1)).toFixed(2)}%`;
+    const update = (to = Number(range.value)) => {
+      const now = Number(range.value); // in steps, from min to max
+      output.textContent = show(to);
       range.setAttribute("aria-valuetext", output.textContent);
+      range.style.setProperty("--from", share(Math.min(now, origin)));
+      range.style.setProperty("--to", share(Math.max(now, origin)));
     };
     range.addEventListener("input", () => {
-      told();
+      update();
       input(Number(range.value));
     });
-    const name = make("label", { for: id, text: label });
-    if (note) name.append(make("small", { text: note }));
-    const row = make("div", { class: "ss-slider" }, name, range, output);
+    update();
+    const row = make("div", { class: "ss-slider" }, make("label", { for: id, text: label }, note ? make("small", { text: note }) : null), range, output);
     return {
       row,
+      range,
+      output,
       get: () => Number(range.value),
       put: (to) => {
         range.value = to;
-        told();
-      },
-      limit: (to) => {
-        range.max = to;
-        told();
+        update(to);
       },
     };
   }
@@ -53,35 +63,40 @@
     return make("button", { type: "button", class: "ss-button", text, onclick: click, ...attributes });
   }
 
-  /** A button that moves a value to and fro between -reach and reach; begin() returns its {value, put} at each start. */
-  function animation(element, reach, begin) {
+  /** A button that plays a movement: begin() returns the function that draws it, s after its start; it ends when true is returned. */
+  function animation(element, begin, text = "Animate", testid = null) {
     let playing = 0;
-    const toggle = button("Animate", () => (playing ? stop() : play()), { "aria-pressed": "false" });
+    const toggle = button(text, () => (playing ? stop() : play()), { "aria-pressed": "false", "data-testid": testid });
+    const press = (on) => {
+      toggle.textContent = on ? "Pause" : text;
+      toggle.setAttribute("aria-pressed", String(on));
+    };
     function play() {
-      const { value, put } = begin(), start = performance.now(), phase = Math.asin(Math.max(-1, Math.min(1, value / reach)));
-      toggle.textContent = "Pause";
-      toggle.setAttribute("aria-pressed", "true");
+      const put = begin(), start = performance.now();
+      press(true);
       const step = (now) => {
         if (!element.isConnected) return;
         playing = requestAnimationFrame(step);
-        put(reach * Math.sin(phase + Math.max(now - start, 0) * 0.0016));
+        if (put(Math.max(now - start, 0) / 1000)) stop();
       };
       playing = requestAnimationFrame(step);
     }
     function stop() {
       cancelAnimationFrame(playing);
       playing = 0;
-      toggle.textContent = "Animate";
-      toggle.setAttribute("aria-pressed", "false");
+      press(false);
     }
-    const restart = () => {
-      if (playing) stop(), play();
-    };
-    return { toggle, stop, restart };
+    return { toggle, stop };
   }
 
-  function tick(text, checked, change) {
-    const box = make("input", { type: "checkbox" });
+  /** The function of s of a value that swings from where it is between -reach and reach. */
+  function swing(value, reach, period = 3.9) {
+    const phase = Math.asin(Math.max(-1, Math.min(1, value / reach)));
+    return (seconds) => reach * Math.sin(phase + (2 * Math.PI * seconds) / period);
+  }
+
+  function tick(text, checked, change, testid = null) {
+    const box = make("input", { type: "checkbox", "data-testid": testid });
     box.checked = checked;
     box.addEventListener("change", () => change(box.checked));
     return make("label", { class: "ss-tick" }, box, make("span", { text }));
@@ -96,41 +111,37 @@
     return { row: make("div", { class: "ss-select" }, make("label", { for: id, text: label }), list), list };
   }
 
-  /** One of a few: radio buttons that look like one bar. */
-  function choice(legend, options, value, change) {
+  /** One of a few: radio buttons that look like one bar; put(null) chooses none. */
+  function choice(legend, options, value, change, testid = null) {
     const name = `ss-${++counted}`;
-    const set = make("fieldset", { class: "ss-choice" }, make("legend", { text: legend }));
-    for (const [key, text] of options) {
-      const radio = make("input", { type: "radio", name, value: key });
-      radio.checked = key === value;
-      radio.addEventListener("change", () => change(key));
-      set.append(make("label", {}, radio, make("span", { text })));
-    }
-    return set;
+    const radios = options.map(([key]) => make("input", { type: "radio", name, value: key, onchange: () => change(key) }));
+    const put = (chosen) => radios.forEach((radio) => { radio.checked = radio.value === chosen; });
+    const row = make("fieldset", { class: "ss-choice", "data-testid": testid }, make("legend", { text: legend }),
+      ...options.map(([key, text], k) => make("label", { "data-value": key }, radios[k], make("span", { text }))));
+    put(value);
+    return { row, put };
   }
 
-  function swatches(entries) {
-    const list = make("ul", { class: "ss-swatches" });
-    for (const [text, colour] of entries) {
-      const dot = make("span", { class: "ss-dot", "aria-hidden": "true" });
-      dot.style.background = `rgb(${colour.map((c) => Math.round(255 * c)).join(",")})`;
-      list.append(make("li", {}, dot, make("span", { text })));
-    }
-    return list;
-  }
+  const swatches = (entries) => make("ul", { class: "ss-swatches" }, ...entries.map(([text, colour]) => make("li", {}, dot(colour), make("span", { text }))));
 
   /** The next round number that is not below value. */
   function niceCeiling(value) {
     if (!(value > 0)) return 1;
     const power = 10 ** Math.floor(Math.log10(value));
-    for (const factor of [1, 1.5, 2, 3, 4, 5, 6, 8, 10]) if (factor * power >= value * 0.999) return factor * power;
-    return 10 * power;
+    return [1, 1.5, 2, 3, 4, 5, 6, 8, 10].find((factor) => factor * power >= value * 0.999) * power;
   }
 
   /** What share of known values lies below, in order of size: quantile(values, 0.98). */
   function quantile(values, share) {
     const known = Float32Array.from(values).filter(Number.isFinite).map(Math.abs).sort();
     return known.length ? known[Math.min(known.length - 1, Math.floor(share * known.length))] : NaN;
+  }
+
+  /** What the colours of displacements up to `top` mean: options of `colourBar` and `paint`. */
+  function displacementScale(model, top, from, unit = "mm") {
+    const { diverging, sequential } = Shapespace.colours;
+    const scale = model.faces ? { map: diverging, range: [-top, top], title: `Inwards (\u2212) or outwards (+) ${from}` } : { map: sequential, range: [0, top], title: `Moved ${from}` };
+    return { ...scale, unit, open: true };
   }
 
   /** The unpacked arrays of a payload: an id or element with base64 inside, bytes, or data that are already unpacked. */
@@ -150,15 +161,15 @@
     return Shapespace.unpack(bytes);
   };
 
-  /** Build when the element comes near the screen; what goes wrong is said in its place. */
-  function lazily(element, payload, build) {
+  /** A widget: `build` with its data and element once the element comes near the screen; errors are shown in its place. */
+  const widget = (build) => (element, payload) => {
     element.classList.add("ss-widget");
     return new Promise((resolve) => {
       const start = async () => {
         try {
           const unpacked = await Shapespace.load(payload);
           element.replaceChildren();
-          resolve(build(unpacked));
+          resolve(build(unpacked, element));
         } catch (error) {
           element.replaceChildren(make("p", { class: "shapespace-note", role: "note", text: error.message }));
           resolve(null);
@@ -171,18 +182,11 @@
       }, { rootMargin: "300px" });
       observer.observe(element);
     });
-  }
-
-  function stage(element, label) {
-    const plate = make("div", { class: "ss-plate" });
-    const controls = make("div", { class: "ss-controls" });
-    element.append(plate, controls);
-    return { view: new Shapespace.View(plate, { label }), plate, controls };
-  }
+  };
 
   Shapespace.widgets = {};
   Shapespace.widgetParts = {
-    colours: () => Shapespace.colours, make, signed, slider, button, animation, tick, select, choice, swatches,
-    niceCeiling, quantile, lazily, stage,
+    colours: () => Shapespace.colours, make, signed, percent, css, dot, slider, button, animation, swing, tick, select, choice, swatches,
+    niceCeiling, quantile, displacementScale, widget,
   };
 })();

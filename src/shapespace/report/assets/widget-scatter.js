@@ -3,14 +3,15 @@
   "use strict";
 
   const Shapespace = window.Shapespace;
-  const { colours, make, signed, select, swatches, lazily, stage } = Shapespace.widgetParts;
+  const { colours, make, signed, select, swatches, staged } = Shapespace.widgetParts;
 
   /** Coefficients as points in three dimensions, coloured by label. */
-  Shapespace.widgets.scatter = (element, payload) =>
-    lazily(element, payload, (unpacked) => {
+  Shapespace.widgets.scatter =
+    staged((unpacked, { stage, controls }) => {
       const { facts, arrays } = unpacked;
       const [n, K] = arrays.points.shape;
-      const { view, plate, controls } = stage(element, `${n} points in the space of coefficients`);
+      const view = stage.a, plate = view.element;
+      view.label = `${n} points in the space of coefficients`;
       const tip = make("div", { class: "ss-tip", hidden: true });
       plate.append(tip);
       const axes = [0, 1, 2].map((k) => Math.min(k, K - 1));
@@ -103,7 +104,7 @@
         make("p", { class: "ss-hint", text: facts.unit ? `Axes in ${facts.unit}.` : "" })
       );
       place();
-      return { view, axes, ticks: () => ticks };
+      return { axes, ticks: () => ticks };
     });
 
   /** A round step of which two or three fit below `most`. */

@@ -7,7 +7,6 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import product
 from math import nan
 from types import MappingProxyType
@@ -51,7 +50,15 @@ from shapespace.report.blocks.wording import (
     training_text,
     words,
 )
-from shapespace.report.inputs.saved_fits import Direction, Folder, Measure, SavedFit, StagedFit, measured_mm
+from shapespace.report.inputs.saved_fits import (
+    Coefficients,
+    Direction,
+    Folder,
+    Measure,
+    SavedFit,
+    StagedFit,
+    measured_mm,
+)
 from shapespace.report.pages.page import OrderedPicture, Page
 from shapespace.report.render import thumbnails
 from shapespace.report.render.scene import pack_fit, pack_model, pack_scatter, pack_surfaces
@@ -124,7 +131,7 @@ def model_part(page: Page, model: ShapeModel, *, figure_of: str = "", to_move: i
         ("Provenance", model.provenance),
         ("Licence", model.licence or "not stated"),
     ]
-    n_shown = min(_MODES_DRAWN, model.n_modes)
+    n_shown, ordered = min(_MODES_DRAWN, model.n_modes), order_model(page, model)
     return [
         modes_to_move(page, model, to_move),
         Facts(rows, "The shape model"),
@@ -133,20 +140,20 @@ def model_part(page: Page, model: ShapeModel, *, figure_of: str = "", to_move: i
             [
                 in_columns(
                     page.figure(
-                        order_modes(page, model),
+                        ordered["modes_figure"],
                         f"{figure_of}Each row: the mean with one mode at −3, 0 and +3 standard deviations, and how far "
                         "each point moves at 3. One scale for all rows.",
                         alt=f"Mean shape and the first {counted(n_shown, 'mode')} at minus and plus three standard "
                         "deviations, with maps of the displacement",
                     ),
                     page.figure(
-                        figures.spectrum_figure(model),
+                        ordered["spectrum_figure"],
                         "Share of the training set's variance in the first modes.",
                         alt=f"Spectrum: {listed(needed) or 'the modes kept contain less than 90 % of the variance'}",
                         chart=True,
                     ),
                     page.figure(
-                        figures.mean_figure(model),
+                        ordered["mean_figure"],
                         "The mean shape from three sides"
                         + (", with the model's landmarks." if model.landmarks else "."),
                         alt="The mean shape from three sides",
@@ -157,14 +164,14 @@ def model_part(page: Page, model: ShapeModel, *, figure_of: str = "", to_move: i
     ]
 
 
-def order_modes(page: Page, model: ShapeModel) -> OrderedPicture:
-    """Order the picture of the first modes of a model once, as early as possible."""
-
-    def order() -> OrderedPicture:
-        drawn = replace(model, training=None)  # which may be large, and is not drawn
-        return page.order(partial(figures.modes_figure, drawn, modes=min(_MODES_DRAWN, model.n_modes)), chart=False)
-
-    return page.once(("modes", model), order)
+def order_model(page: Page, model: ShapeModel) -> Mapping[str, OrderedPicture]:
+    """Order all pictures of a model, as early as possible, and return them by the names of their functions."""
+    drawn = page.once(("drawn", model), lambda: replace(model, training=None))  # which may be large, and is not drawn
+    return {
+        "modes_figure": page.order("modes_figure", drawn, modes=min(_MODES_DRAWN, model.n_modes)),
+        "spectrum_figure": page.order("spectrum_figure", drawn, chart=True),
+        "mean_figure": page.order("mean_figure", drawn),
+    }
 
 
 def quality_part(page: Page, folder: Folder) -> Figure:
@@ -292,18 +299,12 @@ def order_pictures(page: Page, fit: StagedFit, population: FloatArray | None) ->
 
     Args:
         page: page of the pictures.
-        fit: fit with its stages; pictures of the same object are ordered once.
+        fit: fit with its stages.
         population: (N, K) coefficients of other fits in standard deviations, or None.
     """
     names = [name for name in _CAPTIONS if fit.regions is not None or name not in _OF_STAGES]
     options: Mapping[str, Any] = {"coefficients_figure": {"population": population}}
-    return page.once(
-        ("pictures", fit),
-        lambda: {
-            name: page.order(partial(getattr(figures, name), fit, **options.get(name, {})), chart=name in _CHARTS)
-            for name in names
-        },
-    )
+    return {name: page.order(name, fit, chart=name in _CHARTS, **options.get(name, {})) for name in names}
 
 
 def fit_pictures(page: Page, fit: StagedFit, population: FloatArray | None, *, of_paper: bool) -> Block:
@@ -417,30 +418,40 @@ def usable(items: Sequence[_From], load: Callable[[_From], _To]) -> tuple[list[_
 # Coefficients
 
 
-def coefficients_of(fit: SavedFit) -> figures.Coefficients:
+def coefficients_of(fit: SavedFit) -> Coefficients:
     """Return the coefficients of one fit with its label."""
     entry = fit.entry
-    return figures.Coefficients(fit.name, entry.expression, entry.intensity or 0.0, fit.numbers("b"), fit.numbers("z"))
+    return Coefficients(fit.name, entry.expression, entry.intensity or 0.0, fit.numbers("b"), fit.numbers("z"))
 
 
-def scatter(page: Page, points: Sequence[figures.Coefficients]) -> list[Block]:
+def order_scatter(page: Page, points: Sequence[Coefficients]) -> Sequence[OrderedPicture]:
+    """Order the pictures of `scatter`, as early as possible: the matrix, and with three coefficients the space."""
+    in_space = all(len(point.b) >= 3 for point in points)
+    return [
+        page.order("scatter_matrix", points),
+        *([page.order("b_space", points, chart=True)] if in_space else []),
+    ]
+
+
+def scatter(page: Page, points: Sequence[Coefficients]) -> list[Block]:
     """Return the first coefficients of many fits against each other, coloured by label."""
+    ordered, *in_space = order_scatter(page, points)
     labels = list(dict.fromkeys(point.expression for point in points if point.expression))
     coloured = f", coloured by label: {listed(labels)}" if len(labels) > 1 else ""
     matrix = page.figure(
-        figures.scatter_matrix(points),
+        ordered,
         f"The first coefficients of {counted(len(points), 'fit')} against each other{coloured}.",
         alt=f"Scatter matrix of the first coefficients of {counted(len(points), 'fit')}{coloured}",
     )
-    if any(len(point.b) < 3 for point in points):
+    if not in_space:
         return [matrix]
     return [matrix, Folded("The same in space, to be turned", page.tried(lambda: scatter_to_turn(page, points)))]
 
 
 def lines_through_neutral(
     page: Page,
-    points: Sequence[figures.Coefficients],
-    neutral: figures.Coefficients | None,
+    points: Sequence[Coefficients],
+    neutral: Coefficients | None,
     *,
     figures_of: Sequence[str] = ("", ""),
 ) -> Block:
@@ -478,9 +489,9 @@ def lines_through_neutral(
     return in_columns(*pictures)
 
 
-def scatter_to_turn(page: Page, points: Sequence[figures.Coefficients]) -> Turning | Figure:
+def scatter_to_turn(page: Page, points: Sequence[Coefficients]) -> Turning | Figure:
     """Return the widget of b1, b2 and b3 in space, with a still as the fallback."""
-    still = figures.encode_webp(figures.b_space(points), lossless=True)
+    still = page.order("b_space", points, chart=True)
     first = np.stack([point.b[:MODES_IN_WIDGET] for point in points])
     return page.turning(
         "scatter",
@@ -490,7 +501,7 @@ def scatter_to_turn(page: Page, points: Sequence[figures.Coefficients]) -> Turni
             [point.name for point in points],
             axes=[f"b{k + 1}" for k in range(first.shape[1])],
         ),
-        page.image(still, f"b1, b2 and b3 of {counted(len(points), 'fit')} in space"),
+        page.still(still, f"b1, b2 and b3 of {counted(len(points), 'fit')} in space"),
         "Coefficients of all fits in space, in mm.",
         label="Scatter of three coefficients, to be turned",
         still="The still shows the first three from two sides.",

@@ -187,7 +187,6 @@ __getattr__, __dir__ = lazy_names(
             "spectrum_figure",
         ),
         "report.figures.population_figures": (
-            "Coefficients",
             "b_plane",
             "b_space",
             "coefficients_spread",
@@ -198,6 +197,6 @@ __getattr__, __dir__ = lazy_names(
             "scatter_matrix",
         ),
         "cohort.orientation": ("oriented",),
-        "report.inputs.saved_fits": ("StagedFit",),
+        "report.inputs.saved_fits": ("Coefficients", "StagedFit"),
     },
 )

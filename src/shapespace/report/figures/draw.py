@@ -15,7 +15,7 @@ from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from html import unescape
 from importlib import import_module
 from pathlib import Path
@@ -403,8 +403,12 @@ def finish(figure: Figure, **spaces: float) -> Figure:
         if axes.name != "3d" and axes.axison:
             style(axes)
         _scale_marks(axes, LAYOUT.get().scale)
+        # The layout asks twice for the same extent, which takes most of its time.
+        cast(Any, axes).get_tightbbox = cache(axes.get_tightbbox)
     with without_glyph_warnings():
         figure.tight_layout(rect=cast(Any, figure).plots_within, pad=0.4, **spaces)
+    for axes in figure.axes:
+        del cast(Any, axes).get_tightbbox
     return figure
 
 

@@ -404,15 +404,18 @@ def _stage_captions(fit: StagedFit) -> list[str]:
     return [f"{_SHORT_STAGES.get(stage, stage)}\n{mean}" for stage, mean in means.items()]
 
 
-def _from_two_sides(fit: StagedFit, layers: Sequence[Sequence[Layer]], captions: Sequence[str]) -> list[Row]:
+def _from_two_sides(fit: StagedFit, layers: Sequence[Sequence[Layer]], captions: list[str]) -> list[Row]:
+    """Return a row of pictures from the front and one from the side; a single picture of each side is in one row."""
     points = surroundings(fit)
     final = fit.surfaces["final"].vertices
     before = fit.surfaces["before"].vertices if "before" in fit.surfaces else final
     # A start that was near is shown completely; a start far away would make the rest small.
     if np.abs(before.mean(axis=0) - final.mean(axis=0)).max() < _NEAR_START * np.ptp(final, axis=0).max():
         points = np.concatenate([points, before])
-    cameras, size = equal_views([(points, yaw) for yaw in _FRONT_AND_SIDE], len(layers))
+    cameras, size = equal_views([(points, yaw) for yaw in _FRONT_AND_SIDE], max(len(layers), len(_FRONT_AND_SIDE)))
     rows = [render_series(layers, camera=camera, size=size) for camera in cameras]
+    if len(layers) == 1:  # panels of the width of the page would be higher than a screen
+        return [Row([panel for row in rows for panel in row], captions * len(rows))]
     return [Row(rows[0], captions), Row(rows[1])]
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, cast
 
@@ -40,6 +39,7 @@ from shapespace.report.figures.draw import (
     short,
     type_size,
 )
+from shapespace.report.inputs.saved_fits import Coefficients
 from shapespace.report.render.palette import CATEGORIES, MODEL_COLOUR, SEQUENTIAL
 from shapespace.types import FloatArray
 
@@ -290,25 +290,6 @@ _MOST_IN_LEGEND = 16  # layout: entries
 _MOST_DOTS_BIG = 60  # layout: dots drawn at full size
 _LEGEND_LINE = 1.1
 _SPACE_INCHES = 2.5  # layout: inches per panel
-
-
-@dataclass(frozen=True, eq=False)
-class Coefficients:
-    """The coefficients of one scan.
-
-    Args:
-        name: name of the scan.
-        expression: label of the scan, which selects its colour; empty for none.
-        intensity: 0 for neutral to 1, which selects the size of its mark.
-        b: (K,) mm.
-        z: (K,) in standard deviations of the model.
-    """
-
-    name: str
-    expression: str
-    intensity: float
-    b: FloatArray
-    z: FloatArray
 
 
 def scatter_matrix(points: Sequence[Coefficients], modes: int = 4, *, title: str = "") -> Figure:

@@ -440,6 +440,25 @@ class Moment:
 
 
 @dataclass(frozen=True, eq=False)
+class Coefficients:
+    """The coefficients of one scan.
+
+    Args:
+        name: name of the scan.
+        expression: label of the scan, which selects its colour; empty for none.
+        intensity: 0 for neutral to 1, which selects the size of its mark.
+        b: (K,) mm.
+        z: (K,) in standard deviations of the model.
+    """
+
+    name: str
+    expression: str
+    intensity: float
+    b: FloatArray
+    z: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class StagedFit:
     """A fit in the picture frame: the axes of the model's frame, and the size of the scan in mm.
 

@@ -64,7 +64,7 @@ class DemoPage:
             with suppress(ShapespaceError):  # the section of the fit states the reason
                 sections.order_pictures(self.page, self.staged(fit, label), _coefficients(population_z))
         with suppress(ShapespaceError):
-            sections.order_modes(self.page, self.model(self.demo.experiment1))
+            sections.order_model(self.page, self.model(self.demo.experiment1))
         return self.page.html(
             "Low-dimensional surface parameterisation: the paper, run again",
             lead,

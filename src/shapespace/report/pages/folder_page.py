@@ -55,6 +55,7 @@ from shapespace.report.blocks.wording import (
 )
 from shapespace.report.inputs.fit_population import FEWEST, MEASURES, ListedColumn, Population
 from shapespace.report.inputs.saved_fits import (
+    Coefficients,
     Folder,
     SavedFit,
     ScanNotFoundError,
@@ -152,7 +153,7 @@ class FolderPage:
             with suppress(ShapespaceError):  # the section of the fit states the reason
                 sections.order_pictures(self.page, self.staged(fit), self.others(fit))
         with suppress(ShapespaceError):
-            sections.order_modes(self.page, self.model())
+            sections.order_model(self.page, self.model())
         return self.page.html(
             f"{counted(self.total, 'fit')} in {name}",
             [Text(lead)],
@@ -176,6 +177,10 @@ class FolderPage:
         ]
         if sum(fit.fitted for fit in self.fits) < 2:
             del chapters[2]
+        else:
+            with suppress(ShapespaceError):  # the part states the reason
+                sections.order_scatter(self.page, self.compared())
+            self.page.order("error_curves", self.with_distances()[0], chart=True)
         if self.recognised:
             chapters.insert(-2, Chapter("Recognition", lambda: study_page.study_section(self.page, self.folder)))
         chapters[-2:-2] = study_page.analysis_chapters(self.page, self.folder.root, self.analyses)
@@ -294,16 +299,26 @@ class FolderPage:
         which = "These" if len(good) == len(self.fits) else "Of the converged fits, these"
         return [Text(f"{which} lie farthest from their scans on average: {farthest}.")]
 
+    def with_distances(self) -> tuple[Sequence[StagedFit], Sequence[str]]:
+        """Return the fits of `curves`, of which only the distances are valid, and a sentence for each without them."""
+
+        def load() -> tuple[Sequence[StagedFit], Sequence[str]]:
+            # Without stages, each curve needs the scan to be read and the distances to be measured.
+            pictured = [fit for fit in self.fits if fit.pictured and (fit.entry.stages or fit.name in self.places)]
+            fits, problems = sections.usable(pictured[:MOST_CURVES], self.staged)
+            # The process that draws the curves receives one scan only.
+            return [replace(fit, scan=fits[0].scan, surfaces=fits[0].surfaces) for fit in fits], problems
+
+        return self.page.once("curves", load)
+
     def curves(self) -> Figure:
         """Return the figure of the share of the surface within each distance."""
-        # Without stages, each curve needs the scan to be read and the distances to be measured.
-        pictured = [fit for fit in self.fits if fit.pictured and (fit.entry.stages or fit.name in self.places)]
-        fits, problems = sections.usable(pictured[:MOST_CURVES], self.staged)
+        fits, problems = self.with_distances()
         if not fits:
             raise InputError(f"There are no distances to draw: {problems[0]}" if problems else "No surface was saved.")
         some = f" The first {len(fits)} fits of the table." if sum(f.pictured for f in self.fits) > len(fits) else ""
         return self.page.figure(
-            figures.error_curves(fits),
+            self.page.order("error_curves", fits, chart=True),
             "Share of the model's vertices that lie within each distance of the scan, one curve per fit. Vertices "
             f"that the scan does not show are not counted.{some}",
             alt=f"Cumulative distances of {counted(len(fits), 'fit')}",
@@ -476,10 +491,20 @@ class FolderPage:
             )
         return hashes.pop() if hashes else ""
 
+    def compared(self) -> Sequence[Coefficients]:
+        """Return the coefficients of all fits by one model.
+
+        Raises:
+            InputError: there are several models, and none was given.
+        """
+        return self.page.once(
+            "compared", lambda: [sections.coefficients_of(fit) for fit in self.of_one_model(self.model_hash())]
+        )
+
     def together(self) -> list[Block]:
         """Return the coefficients of all fits by one model against each other, and the lines of one subject's."""
         compared = self.of_one_model(self.model_hash())
-        out = sections.scatter(self.page, [sections.coefficients_of(fit) for fit in compared])
+        out = sections.scatter(self.page, self.compared())
         expressive = [fit for fit in compared if fit.entry.intensity]
         subjects = {fit.entry.subject for fit in expressive}
         if (

@@ -7,7 +7,7 @@ import hashlib
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar
 
@@ -58,6 +58,10 @@ class OrderedPicture:
 
     draw: Callable[[], Drawing]
     still: Callable[[], Still]
+
+
+def _draw(name: str, *args: Any, **options: Any) -> Drawing:
+    return getattr(figures, name)(*args, **options)
 
 
 def _drawn_still(draw: Callable[[], Drawing], *, lossless: bool) -> Still:
@@ -141,14 +145,23 @@ class Page:
         """Return a context in which surfaces are drawn in the views of an analysis."""
         return figures.oriented(orientation)
 
-    def order(self, draw: Callable[[], Drawing], *, chart: bool) -> OrderedPicture:
+    def order(self, name: str, *args: object, chart: bool = False, **options: Any) -> OrderedPicture:
         """Return a drawing for `figure` that is made in another process, if there is one.
 
+        A picture of the same objects is made once. Its module, which is slow to import, is not imported here.
+
         Args:
-            draw: function that returns the drawing; other processes must be able to load it.
+            name: name of the function in `report.figures` that draws it.
+            args: objects that it draws.
             chart: whether it is a chart, which is encoded without loss.
+            options: further arguments of the function.
         """
-        return OrderedPicture(draw, self._defer(_drawn_still, draw, lossless=chart))
+
+        def order() -> OrderedPicture:
+            draw = partial(_draw, name, *args, **options)  # refers to the objects, so that their identities stay valid
+            return OrderedPicture(draw, self._defer(_drawn_still, draw, lossless=chart))
+
+        return self.once((name, *map(id, args)), order)
 
     def figure(self, figure: Drawing | OrderedPicture, caption: str, *, alt: str, chart: bool = False) -> Figure:
         """Return a drawing with its caption; `alt` describes the drawing."""

@@ -167,19 +167,12 @@ def pack_model(model: ShapeModel, modes: int | None = None, *, small: bool = Fal
     arrays |= _indices("faces", faces, model.n_vertices, coded=small)
     rank = np.argsort(order)
     facts = {
-        "kind": "model",
-        "names": [f"mode {k + 1}" for k in range(K)],
-        "n_modes": model.n_modes,
-        "n_training": model.n_training,
-        "gauge": model.gauge,
         "landmarks": {
             name: {"vertices": rank[corners].tolist(), "weights": weights.tolist()}
             for name, corners, weights in zip(
                 model.landmarks.names, model.landmarks.corners, model.landmarks.barycentric, strict=True
             )
         },
-        "provenance": model.provenance,
-        "licence": model.licence,
     }
     return pack(arrays, facts)
 
@@ -221,7 +214,6 @@ def pack_morph(
     return pack(
         arrays,
         {
-            "kind": "morph",
             "low": labels[0],
             "high": labels[1],
             "weights": weights.tolist(),
@@ -274,8 +266,8 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: i
     Arrays: `scan` (S, 3) mm and `scan_faces`; `faces` of the model; by stage `surface_STAGE` (V, 3) mm,
     `model_to_scan_STAGE` (V,) and `scan_to_model_STAGE` (S,) mm, signed where the fact `signed` is true, lengths where
     the scan is a point cloud, NaN where unknown; `beyond_model_STAGE` and
-    `beyond_scan_STAGE` (101,), the shares of all vertices farther than 0, 0.1, ... 10 mm; `regions` (V,) codes, where
-    the stages were saved;
+    `beyond_scan_STAGE` (101,), the shares of all vertices farther than 0, 2, ... 200 % of `scale_mm`; `regions` (V,)
+    codes, where the stages were saved;
     of a scan with colours `scan_colours` (S, 3), `colours_final` and `colours_dense` (V, 3) uint8;
     `b`, `z`, `b_stddev` (K,); `history_b` (n, K) mm, `history_T` (n, 3, 4), `history_phase`, `history_iteration`
     and `history_rms_mm` (n,). The fact `scale_mm` is the end of the one colour scale of this fit.
@@ -316,11 +308,9 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: i
         arrays |= _history(staged)
     arrays |= _colours(staged, of_model, of_scan)
     facts = {
-        "kind": "fit",
         "name": staged.name,
         "label": staged.label,
         "status": staged.status,
-        "reason": staged.reason,
         "stages": list(staged.surfaces),
         "scale_mm": staged.scale_mm,
         # Points have no inside.
@@ -330,8 +320,6 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: i
             for stage in staged.surfaces
         },
         "region_shares": list(staged.region_shares.values()),
-        "scan_vertices": len(staged.scan.vertices),
-        "scan_faces": 0 if staged.scan.faces is None else len(staged.scan.faces),
         "thinned": len(scan.vertices) < len(staged.scan.vertices) or len(model.vertices) < len(last.vertices),
     }
     return pack(arrays, facts)
@@ -358,11 +346,9 @@ def pack_surfaces(
     arrays |= _shared_steps(places) if small else {key: _places(points, small) for key, points in places.items()}
     arrays |= {key: np.array(getattr(record, key), dtype=np.float64) for key in ("b", "z", "b_stddev")}
     facts = {
-        "kind": "fit",
         "name": name,
         "label": label,
         "status": record.status,
-        "reason": record.reason,
         "stages": list(surfaces),
         "without_scan": f"The fitted surface is shown alone, since {reason}",
         "thinned": len(model.vertices) < len(last.vertices),
@@ -385,8 +371,8 @@ def _stage_arrays(
             forward, backward = np.abs(forward), np.abs(backward)
         arrays[f"model_to_scan_{stage}"] = quantise(forward, step=step, coded=small)
         arrays[f"scan_to_model_{stage}"] = quantise(backward, step=step, coded=small)
-        arrays[f"beyond_model_{stage}"] = _shares_beyond(staged.model_to_scan_mm[stage])
-        arrays[f"beyond_scan_{stage}"] = _shares_beyond(staged.scan_to_model_mm[stage])
+        arrays[f"beyond_model_{stage}"] = _shares_beyond(staged.model_to_scan_mm[stage], staged.scale_mm)
+        arrays[f"beyond_scan_{stage}"] = _shares_beyond(staged.scan_to_model_mm[stage], staged.scale_mm)
     return arrays
 
 
@@ -445,7 +431,7 @@ def pack_scatter(
     kinds = list(dict.fromkeys(labels))
     return pack(
         {"points": points, "labels": np.array([kinds.index(label) for label in labels], dtype=np.int32)},
-        {"kind": "scatter", "labels": kinds, "names": list(names), "axes": list(axes), "unit": unit},
+        {"labels": kinds, "names": list(names), "axes": list(axes), "unit": unit},
     )
 
 
@@ -550,11 +536,11 @@ def _neighbours_together(faces: IntArray, vertices: int) -> tuple[npt.NDArray[np
     return order, new_faces[np.lexsort((new_faces[:, 2], new_faces[:, 1], new_faces[:, 0]))]
 
 
-def _shares_beyond(signed_mm: FloatArray) -> npt.NDArray[Any]:
-    sorted_mm = np.sort(measured_mm(signed_mm))
-    return (
-        1.0 - np.searchsorted(sorted_mm, np.arange(101) / 10.0 + 1e-9, side="right") / max(len(sorted_mm), 1)
-    ).astype(np.float32)
+def _shares_beyond(signed_mm: FloatArray, scale_mm: float) -> npt.NDArray[Any]:
+    sorted_mm, limits_mm = np.sort(measured_mm(signed_mm)), np.arange(101) / 50.0 * scale_mm
+    return (1.0 - np.searchsorted(sorted_mm, limits_mm + 1e-9, side="right") / max(len(sorted_mm), 1)).astype(
+        np.float32
+    )
 
 
 SCENE_SCRIPTS = tuple(f"scene-{part}.js" for part in (
@@ -563,7 +549,7 @@ SCENE_SCRIPTS = tuple(f"scene-{part}.js" for part in (
 """Views, shape models and colour bars; they need three.min.js before them."""
 
 WIDGET_SCRIPTS = tuple(f"widget-{part}.js" for part in (
-    "parts", "model", "fit", "scatter", "morphospace-drawing", "morphospace",
+    "parts", "stage", "model", "fit", "scatter", "morphospace-drawing", "morphospace",
 ))  # fmt: skip
 """Views with their controls for reports; they need the scripts of scenes and `Shapespace.colours` before them."""
 

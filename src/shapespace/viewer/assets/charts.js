@@ -1,158 +1,84 @@
-/* Small charts, drawn by uPlot: RMS by iteration, and coefficients in standard deviations with their uncertainty. */
+/* Small charts in SVG: RMS by iteration, and coefficients in standard deviations with their uncertainty. */
 (function () {
   "use strict";
 
-  const Viewer = (window.ShapespaceViewer = window.ShapespaceViewer || {});
-  const WIDTH = 350; // px, of a chart in a tab that is not shown
-  const TEXT = 11; // px
+  const Viewer = window.ShapespaceViewer;
+  const { make, signed } = Shapespace.widgetParts;
+  const WIDTH = 352, RIGHT = 8, TOP = 7, BELOW = 18; // px of the chart and the margins of its plot
 
-  const sign = (value, digits = 2) => (value > 0 ? "+" : "") + value.toFixed(digits).replace("-", "\u2212");
-  Viewer.sign = sign;
-
-  /** A colour of the style sheet, looked up at each drawing because the theme may have changed. */
-  const colour = (name) => () => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-  const [ACCENT, WARN, SOFT, LINE, CARD, SHADE] = ["--accent", "--warn", "--soft", "--line", "--card", "--shade"].map(colour);
-  const font = (size) => `${size}px ${getComputedStyle(document.body).fontFamily}`;
-
-  // Drawing ---------------------------------------------------------------------------------------------------------
-
-  const drawn = new Map(); // element of each chart -> its uPlot
-  const resizes = new ResizeObserver((entries) => {
-    for (const { target } of entries) {
-      const plot = drawn.get(target), width = target.clientWidth;
-      if (plot && width && width !== plot.width) plot.setSize({ width, height: plot.height });
-    }
-  });
-  const redraw = () => drawn.forEach((plot) => plot.redraw());
-  new MutationObserver(redraw).observe(document.documentElement, { attributeFilter: ["data-theme"] });
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
-
-  /** Draw a chart into `element` in place of the one there; `facts` become data attributes. Return its uPlot. */
-  function draw(element, label, facts, options, data) {
-    const width = element.clientWidth || WIDTH;
-    const before = Array.from(element.children);
-    const plot = new uPlot({ width, ...options, scales: { ...options.scales, x: { time: false, ...options.scales.x } } }, data, element);
-    before.forEach((child) => child.remove());
-    for (const [root, old] of drawn) {
-      if (root.isConnected) continue;
-      resizes.unobserve(root);
-      old.destroy();
-      drawn.delete(root);
-    }
-    plot.root.setAttribute("role", "img");
-    plot.root.setAttribute("aria-label", label);
-    Object.assign(plot.root.dataset, facts);
-    drawn.set(plot.root, plot);
-    resizes.observe(plot.root);
-    return plot;
+  function svg(tag, attributes, ...children) {
+    const element = document.createElementNS("http://www.w3.org/2000/svg", tag);
+    for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
+    element.append(...children);
+    return element;
   }
 
-  const axis = (size, splits, texts, more) => ({
-    size, gap: 6, font: font(TEXT), stroke: SOFT, splits: () => splits, values: () => texts, ticks: { show: false }, grid: { stroke: LINE, width: 1 }, ...more,
-  });
-
-  /** Fill a rectangle of the plot, given in values of x and y. */
-  function fillBand(plot, x0, x1, y0, y1) {
-    const [left, right] = [x0, x1].map((x) => plot.valToPos(x, "x", true)), [top, bottom] = [y1, y0].map((y) => plot.valToPos(y, "y", true));
-    plot.ctx.fillStyle = SHADE();
-    plot.ctx.fillRect(left, top, right - left, bottom - top);
+  /**
+   * Draw a chart into `element`, in place of the one there. x, y: ranges [low, high]; bands: rectangles [x0, x1, y0, y1];
+   * rules: [[y, text], ...] of the grid; line: [[x, y], ...]; points: [{x, y, error, series, text}], whose text is shown
+   * under the pointer; notes: [[x, text, anchor], ...] below the plot; legend: names of the series; radius: of the points; facts: data attributes.
+   */
+  function draw(element, { label, title, facts, height, left, x, y, bands, rules, line = [], points, notes, legend = [], radius = 4 }) {
+    const across = (value) => left + ((value - x[0]) / (x[1] - x[0])) * (WIDTH - left - RIGHT), up = (value) => TOP + ((y[1] - value) / (y[1] - y[0])) * (height - TOP - BELOW);
+    const write = (text, at, level, anchor) => svg("text", { x: at, y: level, "text-anchor": anchor }, text);
+    const segment = (name, x0, y0, x1, y1) => svg("line", { class: name, x1: x0, y1: y0, x2: x1, y2: y1 });
+    const drawing = svg("svg", { viewBox: `0 0 ${WIDTH} ${height}` },
+      ...bands.map(([x0, x1, y0, y1]) => svg("rect", { class: "band", x: across(x0), y: up(y1), width: across(x1) - across(x0), height: up(y0) - up(y1) })),
+      ...rules.flatMap(([value, text]) => [segment("rule", left, up(value), WIDTH - RIGHT, up(value)), write(text, left - 6, up(value) + 4, "end")]),
+      svg("polyline", { points: line.map(([at, value]) => `${across(at)},${up(value)}`).join(" ") }),
+      ...points.flatMap((point) => [...(point.error ? [segment(point.series, across(point.x), up(point.y - point.error), across(point.x), up(point.y + point.error))] : []),
+        svg("circle", { class: point.series, cx: across(point.x), cy: up(point.y), r: radius })]),
+      ...notes.map(([at, text, anchor]) => write(text, across(at), height - 4, anchor)));
+    const tip = make("div", { class: "tip", hidden: true });
+    const plot = make("div", { class: "plot" }, drawing, tip);
+    plot.addEventListener("pointermove", (event) => {
+      const box = drawing.getBoundingClientRect(), at = ((event.clientX - box.left) / box.width) * WIDTH;
+      const point = points.reduce((best, one) => (!best || Math.abs(across(one.x) - at) < Math.abs(across(best.x) - at) ? one : best), null);
+      tip.hidden = !point?.text;
+      if (tip.hidden) return;
+      const share = (100 * across(point.x)) / WIDTH;
+      tip.textContent = point.text;
+      tip.style.left = `${share}%`;
+      tip.style.transform = `translateX(${-share}%)`;
+    });
+    plot.addEventListener("pointerleave", () => { tip.hidden = true; });
+    const names = legend.map((name, k) => make("span", { class: "ab"[k], text: name }));
+    const chart = make("div", { class: "chart", role: "img", "aria-label": label }, make("div", { class: "title" }, make("span", { text: title }), ...names), plot);
+    Object.assign(chart.dataset, facts);
+    element.replaceChildren(chart);
   }
-
-  /** Write below the plot, aligned at a value of x. */
-  function writeBelow(plot, text, x, align) {
-    const { ctx } = plot;
-    Object.assign(ctx, { font: font(TEXT * uPlot.pxRatio), fillStyle: SOFT(), textAlign: align, textBaseline: "alphabetic" });
-    ctx.fillText(text, plot.valToPos(x, "x", true), ctx.canvas.height - 5 * uPlot.pxRatio);
-  }
-
-  // Charts ----------------------------------------------------------------------------------------------------------
 
   /** RMS (mm) of each iteration, phases apart; `now` marks one of them. */
   Viewer.rmsChart = function (element, rms, phases, now) {
-    const known = rms.filter(Number.isFinite);
-    if (known.length < 1) { element.replaceChildren(); return; }
-    const n = rms.length, last = Math.max(n - 1, 1), second = phases.indexOf(2);
-    const top = Math.max(...known), limit = top * 1.05 || 1;
-    const at = now === null || now === undefined ? n - 1 : now;
-    const values = rms.map((value) => (Number.isFinite(value) ? value : 0));
-    const splits = [0, top / 2, top];
-    draw(element, `RMS distance by iteration, from ${known[0].toFixed(2)} to ${known[known.length - 1].toFixed(2)} mm`, { points: n, now: at }, {
-      title: "RMS distance by iteration (mm)",
-      height: 100,
-      padding: [6, 8, 20, 0],
-      scales: { x: { range: [0, last] }, y: { range: [0, limit] } },
-      axes: [{ show: false }, axis(40, splits, splits.map((value) => value.toFixed(value < 10 ? 1 : 0)))],
-      series: [
-        {},
-        { stroke: ACCENT, width: 1.8, pxAlign: 0, points: { show: false } },
-        { paths: () => null, pxAlign: 0, points: { show: true, size: 12, width: 2, fill: ACCENT, stroke: CARD } },
-      ],
-      legend: { show: false },
-      cursor: { show: false },
-      hooks: {
-        drawClear: [(plot) => { if (second > 0) fillBand(plot, second, last, 0, limit); }],
-        draw: [(plot) => {
-          if (second > n * 0.12 || second < 0) writeBelow(plot, "pose", 0, "left");
-          if (second >= 0) writeBelow(plot, "pose and shape", second, "left");
-          writeBelow(plot, `${n} states`, last, "right");
-        }],
-      },
-    }, [rms.map((_, i) => i), values, values.map((value, i) => (i === at ? value : null))]);
+    const known = rms.filter(Number.isFinite), n = rms.length, second = phases.indexOf(2), last = Math.max(n - 1, 1);
+    if (!known.length) return;
+    const top = Math.max(...known) || 1, value = (i) => (Number.isFinite(rms[i]) ? rms[i] : 0);
+    draw(element, {
+      label: `RMS distance by iteration, from ${known[0].toFixed(2)} to ${known[known.length - 1].toFixed(2)} mm`, title: "RMS distance by iteration (mm)",
+      facts: { points: n, now }, height: 108, left: 40, x: [0, last], y: [0, 1.05 * top],
+      bands: second > 0 ? [[second, last, 0, 1.05 * top]] : [],
+      rules: [0, top / 2, top].map((level) => [level, level.toFixed(level < 10 ? 1 : 0)]),
+      line: rms.map((_, i) => [i, value(i)]), points: [{ x: now, y: value(now), series: "a" }],
+      notes: [...(second > n * 0.12 || second < 0 ? [[0, "pose", "start"]] : []), ...(second >= 0 ? [[second, "pose and shape", "start"]] : []), [last, `${n} states`, "end"]],
+    });
   };
 
   /** Coefficients of the first modes, [{z, error, name}] at most two; the band is one standard deviation of the model. */
   Viewer.coefficientChart = function (element, series, modes) {
-    const K = Math.min(modes, 20, Math.max(...series.map((one) => one.z.length))), count = series.length;
-    const reach = Math.max(3, ...series.map((one) => Math.max(...Array.from(one.z).slice(0, K).map((v) => Math.ceil(Math.abs(v))))));
-    const names = series.map((one) => one.name).filter(Boolean).join(" and ");
-    // The points of all series take turns along x, each series a little aside of the number of the mode.
-    const aside = count > 1 ? Math.min(K / 45, 0.385) : 0;
-    const points = Array.from({ length: K * count }, (_, i) => {
-      const k = Math.floor(i / count), s = i % count, { z, error, name } = series[s];
-      const x = k + 1 + (s - 0.5 * (count - 1)) * aside;
-      return { s, x, mode: k + 1, name, value: k < z.length ? z[k] : null, error: error && Number.isFinite(error[k]) ? error[k] : 0 };
+    const K = Math.min(modes, 20, Math.max(...series.map(({ z }) => z.length))), count = series.length;
+    const reach = Math.max(3, ...series.flatMap(({ z }) => Array.from(z).slice(0, K).map((value) => Math.ceil(Math.abs(value)))));
+    const names = series.map(({ name }) => name).filter(Boolean);
+    const points = series.flatMap(({ z, error, name }, s) => Array.from(z).slice(0, K).map((value, k) => {
+      const sd = error && Number.isFinite(error[k]) ? error[k] : 0;
+      // Two series are a little aside of the number of the mode.
+      const x = k + 1 + (s - 0.5 * (count - 1)) * Math.min(K / 45, 0.385);
+      return { x, y: value, error: sd, series: "ab"[s], text: `mode ${k + 1}: ${signed(value, 2)}${sd ? ` \u00b1 ${sd.toFixed(2)}` : ""}${name ? ` (${name})` : ""}` };
+    }));
+    draw(element, {
+      label: `Coefficients in standard deviations${names.length ? `, ${names.join(" and ")}` : ""}`, title: `Coefficients${names.length ? "" : " (standard deviations)"}${modes > K ? `, first ${K}` : ""}`,
+      facts: { points: points.length }, height: 140, left: 28, x: [0.5, K + 0.5], y: [-reach, reach], bands: [[0.5, K + 0.5, -1, 1]],
+      rules: [-reach, 0, reach].map((value) => [value, signed(value, 0)]), points, legend: names, radius: K > 12 ? 3 : 4,
+      notes: Array.from({ length: K }, (_, k) => k + 1).filter((mode) => K <= 12 || mode % 5 === 0 || mode === 1).map((mode) => [mode, String(mode), "middle"]),
     });
-    const bars = (plot, row) => {
-      const stroke = new Path2D();
-      for (const { s, x, value, error } of points) {
-        if (s !== row - 1 || value === null || !error) continue;
-        const left = plot.valToPos(x, "x", true);
-        stroke.moveTo(left, plot.valToPos(value - error, "y", true));
-        stroke.lineTo(left, plot.valToPos(value + error, "y", true));
-      }
-      return { stroke };
-    };
-    const marks = Array.from({ length: K }, (_, k) => k + 1).filter((mode) => K <= 12 || mode % 5 === 0 || mode === 1);
-    const tip = Viewer.h("div", { class: "tip", hidden: true });
-    const plot = draw(element, `Coefficients in standard deviations${names ? `, ${names}` : ""}`, { points: points.filter(({ value }) => value !== null).length }, {
-      title: `Coefficients${names ? "" : " (standard deviations)"}${modes > K ? `, first ${K}` : ""}`,
-      height: 132,
-      padding: [6, 4, 0, 0],
-      scales: { x: { range: [0.5, K + 0.5] }, y: { range: [-reach, reach] } },
-      axes: [
-        axis(20, marks, marks.map(String), { grid: { show: false } }),
-        axis(28, [-reach, 0, reach], [-reach, 0, reach].map((value) => (value === 0 ? "0" : sign(value, 0)))),
-      ],
-      series: [{}, ...series.map((one, s) => {
-        const stroke = s ? WARN : ACCENT, size = K > 12 ? 7 : 9;
-        const hollow = { show: true, size: size + 1, width: 1.8, fill: CARD, stroke }, filled = { show: true, size, width: 0, fill: stroke };
-        return { label: one.name, class: s ? "b" : "a", stroke, width: 1.4, pxAlign: 0, paths: bars, points: s ? hollow : filled };
-      })],
-      legend: { show: names !== "", live: false, markers: { width: () => 0, fill: () => "" } },
-      cursor: { x: false, y: false, drag: { x: false, y: false }, points: { show: false } },
-      hooks: {
-        drawClear: [(plot) => fillBand(plot, 0.5, K + 0.5, -1, 1)],
-        setCursor: [(plot) => {
-          const point = points[plot.cursor.idx];
-          tip.hidden = !point || point.value === null;
-          if (tip.hidden) return;
-          const { x, mode, name, value, error } = point, left = plot.valToPos(x, "x");
-          tip.textContent = `mode ${mode}: ${sign(value)}${error ? ` \u00b1 ${error.toFixed(2)}` : ""}${name ? ` (${name})` : ""}`;
-          tip.style.left = `${left}px`;
-          tip.style.transform = `translateX(${(-100 * left) / plot.over.clientWidth}%)`;
-        }],
-      },
-    }, [points.map(({ x }) => x), ...series.map((_, row) => points.map(({ s, value }) => (s === row ? value : null)))]);
-    plot.over.append(tip);
   };
 })();

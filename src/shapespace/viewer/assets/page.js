@@ -5,20 +5,10 @@
   const Viewer = (window.ShapespaceViewer = window.ShapespaceViewer || {});
   const $ = (id) => document.getElementById(id);
 
-  /** Return an element: h("button", {type: "button", onclick}, "text", child, ...). */
-  const h = (Viewer.h = function (tag, properties, ...children) {
-    const element = document.createElement(tag);
-    for (const [key, value] of Object.entries(properties || {})) {
-      if (key.startsWith("on")) element.addEventListener(key.slice(2), value);
-      else if (value === true) element.setAttribute(key, "");
-      else if (value !== false && value !== null && value !== undefined) element.setAttribute(key, value);
-    }
-    element.append(...children.filter((child) => child !== null && child !== undefined));
-    return element;
-  });
+  const create = (tag, properties) => Object.assign(document.createElement(tag), properties);
 
   Viewer.save = function (blob, name) {
-    const link = h("a", { href: URL.createObjectURL(blob), download: name });
+    const link = create("a", { href: URL.createObjectURL(blob), download: name });
     document.body.append(link);
     link.click();
     link.remove();
@@ -32,8 +22,9 @@
 
   function alertUser(sentence) {
     alerts += 1;
-    const close = h("button", { type: "button", class: "small quiet", "data-testid": "message-close", onclick: quiet }, "Close");
-    $("message").replaceChildren(h("span", {}, sentence), close);
+    const close = create("button", { type: "button", className: "small quiet", textContent: "Close", onclick: quiet });
+    close.dataset.testid = "message-close";
+    $("message").replaceChildren(create("span", { textContent: sentence }), close);
     $("message").hidden = false;
   }
 
@@ -104,7 +95,7 @@
   function load(...names) {
     return names.reduce((before, name) => before.then(() => {
       if (!loaded.has(name)) loaded.set(name, new Promise((resolve, reject) => {
-        document.head.append(h("script", { src: `/assets/${name}.js`, onload: resolve, onerror: () => { loaded.delete(name); reject(new Error(UNREACHABLE)); } }));
+        document.head.append(create("script", { src: `/assets/${name}.js`, onload: resolve, onerror: () => { loaded.delete(name); reject(new Error(UNREACHABLE)); } }));
       }));
       return loaded.get(name);
     }), Promise.resolve());
@@ -113,7 +104,7 @@
   /** Return an element's own root with style sheets and `content`, once these have loaded; names and styles in it are its own. */
   async function mount(element, styles, content) {
     const root = element.shadowRoot || element.attachShadow({ mode: "open" });
-    const links = styles.map((name) => h("link", { rel: "stylesheet", href: `/assets/${name}.css` }));
+    const links = styles.map((name) => create("link", { rel: "stylesheet", href: `/assets/${name}.css` }));
     const ready = links.map((link) => new Promise((resolve) => { link.onload = link.onerror = resolve; }));
     root.replaceChildren(...links);
     await Promise.all(ready);

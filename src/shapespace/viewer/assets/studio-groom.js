@@ -7,7 +7,7 @@
   const T = window.ShapespaceTexts;
   const G = T.specimens.groom;
   const { Button } = Studio;
-  const COLOUR = [0.05, 0.35, 0.9], ROUND = 48; // of the lines that show a crop, and their number in a circle
+  const COLOUR = [0.2, 0.5, 1], ROUND = 48; // of the lines that show a crop, and their number in a circle
   const KEEPS = { sphere: ["inside", "outside"], plane: ["behind", "front"] };
   const HOLES = "30"; // border edges, at first: the default of MeshLab
 
@@ -52,9 +52,12 @@
     return [a, b, b, c, c, d, d, a, point, add(point, [back, keep === "front" ? 0.3 * size : -0.3 * size])];
   }
 
-  /** Centre and radius, or point and normal, as the command takes them: in the frame of the file, which a mirrored scan is not shown in. */
+  /** A point or direction of the view in the frame of the file, and the reverse: a mirrored scan is shown reflected. */
+  const reflected = ([x, y, z], mirrored) => [mirrored ? -x : x, y, z].map((value) => Number(value.toPrecision(9)));
+
+  /** Centre and radius, or point and normal, as the command takes them. */
   function cropText({ tool, point, radius, axes, keep }, mirrored) {
-    const side = mirrored ? -1 : 1, there = ([x, y, z]) => [side * x, y, z];
+    const there = (values) => reflected(values, mirrored);
     const numbers = tool === "sphere" ? [...there(point), radius] : [...there(point), ...there(axes[2]).map((value) => (keep === "front" ? value : -value))];
     return `${tool === "plane" ? "plane" : keep === "inside" ? "sphere" : "outside"}:${numbers.map((value) => Number(value.toPrecision(9))).join(",")}`;
   }
@@ -71,16 +74,20 @@
   }
 
   /** The steps for one scan, in its 3-D view. */
-  Studio.Groom = function Groom({ specimen, view, ready }) {
+  Studio.Groom = function Groom({ specimen, view, ready, cropping }) {
     const [fields, options] = useSteps();
     const [tool, setTool] = useState("");
     const [crop, setCrop] = useState(null);
     const click = useRef(null), size = useRef(1);
+    cropping.current = Boolean(tool);
+    /** Move the crop to a point of the view, facing the user. */
+    const put = (name, point) => {
+      const { right, up, back } = view.current._camera.axes();
+      setCrop({ tool: name, keep: KEEPS[name][0], radius: size.current / 4, ...(crop && crop.tool === name ? { keep: crop.keep, radius: crop.radius } : {}), point, axes: [right, up, back] });
+    };
     click.current = (event) => {
       const hit = tool && view.current.pick(event.clientX, event.clientY, ["scan"]);
-      if (!hit) return;
-      const { right, up, back } = view.current._camera.axes();
-      setCrop({ tool, keep: KEEPS[tool][0], radius: size.current / 4, ...(crop && crop.tool === tool ? { keep: crop.keep, radius: crop.radius } : {}), point: hit.point, axes: [right, up, back] });
+      if (hit) put(tool, hit.point);
     };
     useEffect(() => {
       if (!ready || !view.current.works) return;
@@ -93,7 +100,12 @@
       else view.current.remove("crop");
     }, [crop, ready]);
     if (Studio.state.read_only) return null;
-    const choose = (chosen) => { setTool(chosen === tool ? "" : chosen); setCrop(null); };
+    const choose = (chosen) => {
+      setTool(chosen === tool ? "" : chosen);
+      if (chosen === tool) setCrop(null);
+      else put(chosen, view.current._camera.home.target); // where the keyboard starts from
+    };
+    const move = (point) => { if (point) put(tool, reflected(point, specimen.mirrored)); };
     const failed = Studio.jobsOf(["groom"]).slice(0, 1).find((job) => job.status === "failed" && job.options.ids.includes(specimen.id));
     const run = async () => {
       const all = { ids: [specimen.id], ...(crop ? { "--crop": cropText(crop, specimen.mirrored) } : {}), ...options };
@@ -103,10 +115,12 @@
     return html`
       <fieldset class="choices groom" data-testid="groom"><legend>${G.title}</legend>
         <div class="row">${fields}${["sphere", "plane"].map((name) => html`<${Button} small aria-pressed=${tool === name} testid=${`crop-${name}`} disabled=${!ready} onclick=${() => choose(name)}>${G[name]}<//>`)}</div>
-        ${tool && html`<div class="row"><span class="hint">${G.click[tool]}</span>
+        ${tool && html`<div class="row crop"><span class="hint">${G.click[tool]}</span>
+          ${crop && html`<${Studio.Coordinates} key=${tool} testid="crop" label=${G.point[tool]} axisLabel=${(axis) => G.axis(axis, tool)} point=${reflected(crop.point, specimen.mirrored)} size=${specimen.extent} onsend=${move} onmove=${move} />`}
+          ${tool === "plane" && html`<${Button} small testid="crop-face" onclick=${() => put(tool, crop.point)}>${G.face}<//>`}
           ${crop && crop.tool === "sphere" && html`<label>${G.radius} <input type="range" min="0.01" max="1" step="0.01" data-testid="crop-radius" value=${crop.radius / size.current} oninput=${(event) => setCrop({ ...crop, radius: size.current * Number(event.target.value) })} /></label>`}
           ${crop && html`<label>${G.keep} <select data-testid="crop-keep" value=${crop.keep} onchange=${(event) => setCrop({ ...crop, keep: event.target.value })}>${KEEPS[tool].map((side) => html`<option value=${side}>${G.sides[side]}</option>`)}</select></label>
-          <span class="hint" data-testid="crop-share">${G.keeps(Math.round(100 * keptShare(crop, view.current._things.get("scan").object.geometry.attributes.position.array)))}</span>`}</div>`}
+          <span class="hint" role="status" data-testid="crop-share">${G.keeps(Math.round(100 * keptShare(crop, view.current._things.get("scan").object.geometry.attributes.position.array)))}</span>`}</div>`}
         <div class="row"><${Button} small strong testid="groom-apply" disabled=${busy || !(crop || Object.keys(options).length)} onclick=${run}>${G.apply}<//>
           <${Original} specimens=${[specimen]} ondone=${() => {}} /><span class="hint" role="status">${busy ? G.running : failed ? failed.message : G.hint}</span></div>
       </fieldset>`;

@@ -8,6 +8,7 @@
   const J = T.jobs;
   const { Button, CopyButton } = Studio;
   const SHORT_HELP = 100; // characters, about two lines
+  const CORRESPONDENCES = ["correspond", "redo"];
   const CHECK_AFTER = 400; // ms without a change of the form
 
   const duration = (seconds) => seconds < 90 ? J.seconds(Math.max(1, Math.round(seconds))) : seconds < 5400 ? J.minutes(Math.round(seconds / 60)) : J.hours((seconds / 3600).toFixed(1));
@@ -19,6 +20,10 @@
 
   Studio.titleOf = titleOf;
   Studio.fileAddress = (path) => `/files/${path.split("/").map(encodeURIComponent).join("/")}`;
+
+  const PLACED = "0", MISSING = "missing-landmarks"; // landmarks on scans as the data of a question, and its option for them
+  /** Whether a question can be about the landmarks on scans. */
+  const hasPlaced = (kind) => Boolean(Studio.forms[kind]?.options.some((option) => option.flag === MISSING)) && Studio.state.project.specimens.some((one) => one.included && one.set === "training" && Object.keys(one.points).length > 0);
 
   // Forms -----------------------------------------------------------------------------------------------------------
 
@@ -87,12 +92,16 @@
     const initial = useMemo(() => Object.fromEntries((form ? form.options : []).map((option) => [option.flag, option.initial === null ? "" : option.initial])), [form]);
     // The settings open as the last run had them.
     const [values, setValues] = useState(() => ({ ...initial, ...defaults, ...Studio.jobsOf([kind])[0]?.options }));
-    const [on, setOn] = useState("");
+    const placed = hasPlaced(kind);
+    const [on, setOn] = useState(() => (placed && Studio.jobsOf([kind])[0]?.on === 0 ? PLACED : ""));
     const [checks, setChecks] = useState(null);
     const [checkedFor, setCheckedFor] = useState(null); // settings of these checks; a problem of earlier ones does not keep a run back
     const [starting, setStarting] = useState(false);
     const { columns, jobs, revision, odd } = Studio.state.project;
+    const ready = jobs.filter((job) => sources.includes(job.kind) && (job.status === "done" || String(job.number) === on)).reverse();
+    const ofPlaced = placed && (on === PLACED || (!on && !ready.some((job) => CORRESPONDENCES.includes(job.kind))));
     const options = form ? changedOptions(form, values) : {};
+    if (!ofPlaced) delete options[MISSING];
     const asked = JSON.stringify([options, on]);
     useEffect(() => {
       if (!checked) return undefined;
@@ -105,7 +114,8 @@
       return () => { current = false; clearTimeout(timer); };
     }, [asked, revision, kind]);
     if (!form) return null;
-    const possible = jobs.filter((job) => sources.includes(job.kind) && job.status === "done").reverse();
+    const running = jobs.findLast((job) => sources.includes(job.kind) && CORRESPONDENCES.includes(job.kind) && Studio.isActive(job));
+    const wait = html`<label class="check"><input type="checkbox" data-testid="wait" checked=${on === String(running?.number)} onchange=${(event) => setOn(event.target.checked ? String(running.number) : "")} />${J.wait}</label>`;
     const show = (option) => html`<${Option} key=${option.flag} option=${option} value=${values[option.flag]} columns=${columns} onvalue=${(value) => setValues((before) => ({ ...before, [option.flag]: value }))} />`;
     const folded = form.options.filter((option) => !option.visible);
     const missing = form.options.some((option) => option.required && !options[option.flag]);
@@ -120,9 +130,11 @@
     const word = label || (jobs.some((job) => job.kind === kind) ? J.runAgain : J.runOf[kind] || J.run);
     return html`
       <form class="job-form" data-testid=${`form-${kind}`} onsubmit=${run} novalidate>
-        ${possible.length > 1 && html`<label class="option"><span>${J.source}</span><select data-testid="source" value=${on} onchange=${(event) => setOn(event.target.value)}>
-          <option value="">${J.newest}</option>${possible.map((job) => html`<option key=${job.number} value=${job.number}>${titleOf(job)}</option>`)}</select></label>`}
-        ${form.options.filter((option) => option.visible).map(show)}
+        ${running && on !== PLACED && html`<div class="outdated" role="status" data-testid="newer-runs"><strong>${J.newerRuns(action(running.kind), running.number, on === String(running.number))}</strong>${wait}</div>`}
+        ${ready.length + placed > 1 && html`<label class="option"><span>${J.source}</span><select data-testid="source" value=${on} onchange=${(event) => setOn(event.target.value)}>
+          <option value="">${J.newest}</option>${placed && html`<option value=${PLACED} selected=${on === PLACED}>${J.placed}</option>`}${ready.map((job) => html`<option key=${job.number} value=${job.number}>${titleOf(job)}</option>`)}</select></label>`}
+        ${placed && !ready.length && html`<p class="hint" data-testid="of-placed">${J.source}: ${J.placed}</p>`}
+        ${form.options.filter((option) => option.visible && (ofPlaced || option.flag !== MISSING)).map(show)}
         ${folded.length > 0 && html`<details data-testid="more-options"><summary>${J.more(folded.length)}</summary>${folded.map(show)}</details>`}
         ${children}
         ${kind === "correspond" && odd.length > 0 && html`<p class="odd"><a href="#specimens" data-testid="odd-link">${T.specimens.odd.link(odd.length)}</a></p>`}
@@ -225,6 +237,7 @@
       <div class="row bar result-bar">
         ${finished.length > 1 ? html`<label>${J.result} <select data-testid="result" value=${job.number} onchange=${(event) => choose(Number(event.target.value))}>
           ${finished.map((one) => html`<option key=${one.number} value=${one.number} selected=${one === job}>${kindOf(one)}, ${titleOf(one)}</option>`)}</select></label>` : html`<strong>${kindOf(job)}</strong>`}
+        <${Studio.Views} on=${Studio.frameOf(job)} shown=${Studio.pane?.result === job.number ? Studio.pane.oriented?.() : null} />
         <span class="grow"></span>
         ${reportOf(job) && html`<a href=${reportOf(job).href} target="_blank" rel="noopener" data-testid="open-result">${J.full}</a>`}
         <${Outdated} job=${job} />
@@ -256,5 +269,5 @@
       ${Studio.isActive(job) && html` <${Button} edits small testid=${`elsewhere-cancel-${job.number}`} onclick=${() => Studio.act(`/api/jobs/${job.number}/cancel`)}>${J.cancel}<//>`}</p>`)}</div>`;
   };
 
-  Object.assign(Studio, { Elsewhere, Outdated, duration, action, kindOf, JobForm, JobPanel, Result, Settings, Jobs, useResult });
+  Object.assign(Studio, { hasPlaced, Elsewhere, Outdated, duration, action, kindOf, JobForm, JobPanel, Result, Settings, Jobs, useResult });
 })();

@@ -9,10 +9,10 @@
   // Scripts and style sheets, in this order, which are loaded when they are first needed.
   const SCRIPTS = {
     surfaces: ["scene", "surfaces"],
-    model: ["scene", "uPlot.iife.min", "charts", "coefficients-csv", "fit-controls", "fit-view", "viewer-stage", "viewer-model", "viewer-compare", "viewer-fits", "viewer"],
+    model: ["scene", "charts", "coefficients-csv", "viewer-compare", "viewer-fits", "viewer"],
     report: ["scene", "report"],
   };
-  const STYLES = { surfaces: ["widgets", "viewer"], model: ["widgets", "uPlot.min", "viewer"], report: ["report", "widgets"] };
+  const STYLES = { surfaces: ["widgets", "viewer"], model: ["widgets", "viewer"], report: ["report", "widgets"] };
   // Elements of a report that could act in the page; reports are read from files.
   const NOT_SHOWN = "script:not([type='application/octet-stream']), style, link, meta, base, iframe, frame, object, embed, form";
 
@@ -110,7 +110,11 @@
           ...latest.current, place: isMine ? place : {}, onplace: later,
           onvertex: (vertex) => latest.current.onvertex?.(vertex), onlandmark: (...moved) => latest.current.onlandmark?.(...moved),
           onselected: (names) => latest.current.onselected?.(names),
-          onready: () => { element.dataset.ready = "true"; },
+          onready: () => {
+            element.dataset.ready = "true";
+            Studio.pane = { result, oriented: shown.current?.oriented };
+            Studio.changed();
+          },
         });
         if (ended) { opened.dispose(); return; }
         shown.current = opened;
@@ -119,6 +123,7 @@
       return () => {
         ended = true;
         clearTimeout(timer);
+        Studio.pane = null;
         if (shown.current) shown.current.dispose();
         shown.current = null;
       };

@@ -27,7 +27,7 @@
 
   function Question({ kind, next, onback }) {
     const [job, select] = useResult([kind]);
-    const ready = Boolean(Studio.newest(...sources(kind)));
+    const ready = Boolean(Studio.newest(...sources(kind))) || Studio.hasPlaced(kind);
     const busy = Studio.jobsOf([kind]).some(Studio.isActive);
     const controls = html`
       <${Button} small testid="all-questions" onclick=${onback}>← ${Q.all}<//>

@@ -50,7 +50,7 @@
     return JSON.stringify(columns.map(([column, classes], k) => [column, specimen.cells[column] || "", k ? "" : COLOURS[Object.keys(classes).filter(Boolean).sort().indexOf(specimen.cells[column])] || ""]).filter(([, name]) => name));
   }
 
-  function Card({ specimen, groups, names, selected, onselect }) {
+  function Card({ specimen, groups, names, views, selected, onselect }) {
     const tags = [specimen.set === "new" && S.new, specimen.mirrored && S.mirrored, specimen.groomed && S.groom.done, specimen.unit && S.unit(specimen.unit)].filter(Boolean);
     return useMemo(() => html`
       <li class=${`card ${specimen.included ? "" : "excluded"}`} data-testid=${`card-${specimen.id}`} data-state=${specimen.state}>
@@ -65,7 +65,7 @@
         ${groups !== "[]" && html`<div class="row">${JSON.parse(groups).map(([column, name, colour]) => html`<span class="tag group" title=${`${column}: ${name}`}>${colour && html`<i style=${{ background: colour }}></i>`}${name}</span>`)}</div>`}
         ${Studio.placed(specimen) > 0 && html`<p class="finding" data-testid=${`placed-${specimen.id}`}>${S.marks.placed(Studio.placed(specimen), names.length)}</p>`}
         <${Studio.Findings} specimen=${specimen} />
-      </li>`, [specimen, groups, names, selected, onselect]);
+      </li>`, [specimen, groups, names, views, selected, onselect]);
   }
 
   /** Specimens that differ from the others, each with its view and a unit in which it would not. */
@@ -235,7 +235,7 @@
         </div>
         ${!listed.length && html`<p class="hint">${S.nothing}</p>`}
         ${layout === "cards"
-          ? html`<ul class="cards" data-testid="cards">${shown.map((one) => html`<${Card} key=${one.id} specimen=${one} groups=${groupsOf(one, project.counts)} names=${project.point_names} selected=${selection.has(one.id)} onselect=${select} />`)}</ul>`
+          ? html`<ul class="cards" data-testid="cards">${shown.map((one) => html`<${Card} key=${one.id} specimen=${one} groups=${groupsOf(one, project.counts)} names=${project.point_names} views=${project.views} selected=${selection.has(one.id)} onselect=${select} />`)}</ul>`
           : html`<${Studio.Table} listed=${listed} shown=${shown} columns=${project.columns} selection=${selection} onselect=${select} onselectall=${selectAll} />`}
         ${listed.length > limit && html`<${Button} class="more" testid="show-more" onclick=${() => setLimit(limit + SHOWN)}>${S.more(Math.min(SHOWN, listed.length - limit))}<//>`}
       <//>`;

@@ -105,7 +105,8 @@
       <${Jobs} kinds=${kinds} />
       ${built && html`<div class="row nexts"><${Next} name="model" next=${next} ready=${!isBusy("build")} /><${Button} class="wide" testid="go-fit" onclick=${() => go("fit")}>${T.fitNext}<//></div>`}
       <${Settings} key="settings" kinds=${["build"]}><${JobForm} kind="build" sources=${sources} strong=${ready && !built && !isBusy("build")} disabled=${!ready || isBusy("build")} /><//>
-      ${ready && html`<${More} kind="quality" sources=${sources} disabled=${isBusy("quality")} /><${More} kind="morphospace" sources=${sources} defaults=${{ "--group": Object.keys(project.counts)[0] || "" }} disabled=${isBusy("morphospace")} />`}`;
+      ${ready && html`<${More} kind="quality" sources=${sources} disabled=${isBusy("quality")} />`}
+      ${(ready || Studio.hasPlaced("morphospace")) && html`<${More} kind="morphospace" sources=${sources} defaults=${{ "--group": Object.keys(project.counts)[0] || "" }} disabled=${isBusy("morphospace")} />`}`;
     return html`<${Step} name="model" title=${T.model.title} controls=${controls} select=${select} job=${job} empty=${T.model.empty} on=${{ onselected: setNames }}>
       ${selected.length > 0 && html`<${Studio.SelectionBar} selected=${selected} onclear=${() => setNames([])} />`}<//>`;
   };

@@ -14,6 +14,7 @@
     forms: {}, // of /api/forms
     volumes: [], // uploaded label volumes whose labels are not chosen yet: {file, name, set}
     uploads: null, // of the last drop
+    pane: null, // the result that is drawn: {result, oriented()}, see Viewer.openSurfaces
     changed: () => {}, // draws the page
   });
 
@@ -72,7 +73,7 @@
       const old = known.get(specimen.id);
       return old && JSON.stringify(old) === JSON.stringify(specimen) ? old : specimen;
     });
-    for (const key of ["columns", "point_names"]) if (JSON.stringify(before[key]) === JSON.stringify(state.project[key])) state.project[key] = before[key];
+    for (const key of ["columns", "point_names", "views"]) if (JSON.stringify(before[key]) === JSON.stringify(state.project[key])) state.project[key] = before[key];
   }
 
   // Scans may have been replaced in another program, which sends no event.
@@ -213,7 +214,9 @@
   /** Add a label volume; its labels are asked for when all files of the drop are there. */
   async function uploadVolume(file, set) {
     checkSize(file, T.uploads.volumeTooLarge);
-    const { file: stored } = await json(`/api/volumes?name=${encodeURIComponent(file.name)}`, { method: "PUT", body: file });
+    const { file: stored, same_as: same } = await json(`/api/volumes?name=${encodeURIComponent(file.name)}`, { method: "PUT", body: file });
+    if (same) Studio.uploads.notes.push(T.uploads.same(file.name, same));
+    if (Studio.volumes.some((volume) => volume.file === stored)) return;
     Studio.volumes.push({ file: stored, name: file.name, set });
     Studio.volumes.sort((a, b) => byName(a.name, b.name));
   }

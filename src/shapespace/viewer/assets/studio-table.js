@@ -51,6 +51,7 @@
       if (current.current === text) set(null);
     };
     const key = (event) => {
+      if (event.isComposing) return; // Enter and arrow keys are those of an input method
       const input = event.target, caret = input.selectionStart === input.selectionEnd ? input.selectionStart : -1;
       const all = input.selectionEnd - input.selectionStart === input.value.length;
       if (event.key === "Escape") { set(null); return; }
@@ -76,7 +77,7 @@
   const setUnit = (specimen, select) => Studio.editBy({ what: "unit", ids: [specimen.id], unit: select.value }, () => { select.value = specimen.unit; });
   const setMirror = (specimen, box) => Studio.editBy({ what: "mirror", ids: [specimen.id], mirrored: box.checked }, () => { box.checked = specimen.mirrored; });
 
-  function Row({ specimen, row, columns, names, selected, onselect, onblock }) {
+  function Row({ specimen, row, columns, names, views, selected, onselect, onblock }) {
     // Unchanged rows are not compared again; the state keeps unchanged specimens.
     return useMemo(() => html`
       <tr class=${`${specimen.included ? "" : "excluded"} ${selected ? "selected" : ""}`} data-testid=${`row-${specimen.id}`}>
@@ -94,16 +95,22 @@
         <td class="number">${specimen.triangles ? specimen.triangles.toLocaleString("en") : ""}</td>
         <td><${Studio.ShowScan} specimen=${specimen} /></td>
         <td class="findings"><${Studio.Findings} specimen=${specimen} /></td>
-      </tr>`, [specimen, row, columns, names, selected, onselect, onblock]);
+      </tr>`, [specimen, row, columns, names, views, selected, onselect, onblock]);
   }
 
   function AddColumn() {
     const [name, setName] = useState(null);
     const ref = useRef(null);
     useEffect(() => { if (ref.current) ref.current.focus(); }, [name === null]);
+    const add = async (event) => {
+      event.preventDefault();
+      if (!(await Studio.edit({ what: "add-column", column: name.trim() }))) return;
+      setName(null);
+      document.querySelector(`input[data-row="0"][data-column="${Studio.state.project.columns.length}"]`)?.focus(); // its first cell
+    };
     if (name === null) return html`<${Button} edits testid="add-column" onclick=${() => setName("")}>${S.addColumn}<//>`;
     return html`
-      <form class="row inline" onsubmit=${async (event) => { event.preventDefault(); if (await Studio.edit({ what: "add-column", column: name.trim() })) setName(null); }}>
+      <form class="row inline" onsubmit=${add}>
         <input ref=${ref} aria-label=${S.columnName} placeholder=${S.columnName} required data-testid="column-name" value=${name} oninput=${(event) => setName(event.target.value)}
           onkeydown=${(event) => { if (event.key === "Escape") setName(null); }} />
         <button class="small" data-testid="column-add">${S.add}</button>
@@ -138,7 +145,7 @@
 
   /** A table of `listed`; pasted blocks go on to specimens that are not shown yet. */
   Studio.Table = function Table({ listed, shown, columns, selection, onselect, onselectall }) {
-    const { point_names: names } = Studio.state.project;
+    const { point_names: names, views } = Studio.state.project;
     const [removing, setRemoving] = useState(null);
     const [pasting, setPasting] = useState(null);
     const order = useRef(listed);
@@ -163,7 +170,7 @@
             <th scope="col">${S.columns.set}</th><th scope="col">${S.columns.unit}</th><th scope="col">${S.columns.mirror}</th>
             ${names.length > 0 && html`<th scope="col" class="number">${S.marks.title}</th>`}<th scope="col" class="number">${S.columns.extent}</th><th scope="col" class="number">${S.columns.size}</th><th scope="col">${S.scan.open}</th><th scope="col">${S.columns.findings}</th>
           </tr></thead>
-          <tbody>${shown.map((specimen, row) => html`<${Row} key=${specimen.id} specimen=${specimen} row=${row} columns=${columns} names=${names} selected=${selection.has(specimen.id)} onselect=${onselect} onblock=${onblock} />`)}</tbody>
+          <tbody>${shown.map((specimen, row) => html`<${Row} key=${specimen.id} specimen=${specimen} row=${row} columns=${columns} names=${names} views=${views} selected=${selection.has(specimen.id)} onselect=${onselect} onblock=${onblock} />`)}</tbody>
         </table>
       </div>
       ${pasting !== null && html`<${Preview} match=${pasting} onclose=${() => setPasting(null)} />`}

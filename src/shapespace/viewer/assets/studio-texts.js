@@ -57,16 +57,19 @@
       marks: {
         title: "Landmarks", manage: "Landmarks", placed: (number, all) => `${number} of ${all} landmarks`, of: (number, all) => `${number} of ${all} placed`, missing: "missing", isPlaced: "placed",
         hint: (name) => `Click ${name} on the scan, or type its coordinates. Drag a landmark to move it.`, done: "All landmarks are placed. Drag one to move it.", none: "Name a landmark, then click its place on the scan.",
-        name: "New landmark", add: "Add", coordinates: (name) => `Coordinates of ${name}`, axis: (axis, name) => `${axis} of ${name}`, file: "In the unit and axes of the file; arrow keys move it in small steps.",
+        name: "New landmark or curve", points: "Points of a curve", pointsOf: "Points of a curve", add: "Add", closed: "closed", curve: (name) => `${name} (curve)`, pair: "Mirrors", noPair: "(none)", pairOf: (name) => `Mirrored pair of ${name}`, countOf: (name) => `Number of points of ${name}`, closedOf: (name) => `${name} is closed`,
+        along: (curve) => `Click the points of ${curve} in their order along it. Another number of points, under Landmarks above the cards, spaces them evenly on all scans.`,
+        coordinates: (name) => `Coordinates of ${name}`, axis: (axis, name) => `${axis} of ${name}`, file: "In the unit and axes of the file; arrow keys move it in small steps.",
         remove: "Remove from this scan", removeOf: (name) => `Remove ${name} from this scan`, removeAll: (name) => `Remove the landmark ${name} from all scans`, specimens: "Specimens",
-        intro: "Correspondence, and fits by a model with the same landmarks, use the landmarks of scans. An export has them in the unit and axes of each scan.", download: "Download",
+        intro: "Correspondence, and fits by a model with the same landmarks, use the landmarks of scans. An export has them in the unit and axes of each scan. Questions can be about them without a correspondence. Points of curves then slide; another number spaces them evenly on all scans. Asymmetry needs the pairs that mirror each other, which names such as left arch and right arch show.", download: "Download",
       },
       odd: { title: "These specimens differ from the others", setUnit: (unit) => `Set its unit to ${unit}`, link: (number) => `${count(number, "specimen differs", "specimens differ")} from the others: look at ${number === 1 ? "it" : "them"} first`, more: (number) => `${count(number, "more specimen")}` },
       groom: {
         open: "Groom", done: "groomed", title: "Groom", largest: "Keep the largest piece", outer: "Remove inner surfaces", holes: "Fill holes with border edges up to",
         hint: "The part that remains keeps its coordinates and its unit. The file of the scan stays as it is.", apply: "Groom", original: "Use the original scan", running: "Being groomed",
         sphere: "Crop by a sphere", plane: "Crop by a plane", radius: "Radius", keep: "Keep", sides: { inside: "the part inside", outside: "the part outside", behind: "the part behind it", front: "the part in front of it" },
-        click: { sphere: "Click the centre of the sphere on the scan.", plane: "Turn the scan, then click a point on it: the plane passes through this point and faces you." },
+        click: { sphere: "Click the centre of the sphere on the scan, or type its coordinates.", plane: "Turn the scan, then click a point on it, or type its coordinates: the plane passes through this point and faces you." },
+        point: { sphere: "Centre of the sphere", plane: "Point of the plane" }, axis: (axis, tool) => `${axis} of the ${tool === "sphere" ? "centre" : "point"}`, face: "Turn the plane to the front",
         keeps: (percent) => `${percent} % of the points that are drawn remain.`, clear: "No crop",
       },
       volumes: {
@@ -87,6 +90,11 @@
       found: (repairs, notes) => [repairs && count(repairs, "repair"), notes && count(notes, "note")].filter(Boolean).join(", "),
       fixed: "Repaired: ", refused: "Cannot be used: ", note: "", nothing: "No specimen matches the filter.",
     },
+    views: {
+      title: "Named views", first: "Name this view", edit: "Edit views", name: "Name of this view", names: ["dorsal", "ventral", "lateral", "medial", "anterior", "posterior"], roll: "Rotate",
+      save: "Save", rename: (name) => `Name of the view ${name}`, remove: (name) => `Remove the view ${name}`, take: (output) => `Use the views of ${output}`,
+      hint: "Turn the object, then name its view. The views are offered on these surfaces and their models.", scans: "Turn the scan, then name its view. The views are offered on all scans, and are right where their files have the same axes.",
+    },
     uploads: {
       progress: (done, total) => `Adding file ${Math.min(done + 1, total)} of ${total}`, finished: (added) => `${count(added, "file")} added.`,
       leftOut: (number) => `${count(number, "file")} not added`, tooLarge: (name, limit) => `${name} is larger than ${limit} MB; add it from this machine instead.`, volumeTooLarge: (name, limit) => `${name} is larger than ${limit} MB; crop it to the object, for example in 3D Slicer.`,
@@ -106,7 +114,7 @@
       outdated: {
         specimens: "Made before specimens were changed, excluded or included, or a scan was replaced.", table: "Made before the table was changed.", landmarks: "Made before the landmarks were changed.",
         redone: "Made before a scan was registered again.", source: "Made from a result that is outdated; run that one again first.",
-      }, source: "Made from", newest: "newest result",
+      }, source: "Made from", newest: "newest result", placed: "Landmarks on the scans", newerRuns: (action, number, waits) => `${action} ${number} is not finished. This run ${waits ? "waits for it" : "uses an earlier result"}.`, wait: "Wait for its end, and use its result",
       progress: ({ doing, done, total }) => total ? `${doing} (${done} of ${total})` : doing, progressLabel: (kind) => `Progress of: ${kind}`,
       took: (time) => `took ${time}`, left: (time) => `about ${time} left in this step`,
       seconds: (value) => `${value} s`, minutes: (value) => `${value} min`, hours: (value) => `${value} h`,
@@ -127,7 +135,7 @@
     questions: {
       title: "What do you want to know?", all: "All questions", earlier: "Earlier results", columns: "Columns", formula: "Formula", size: "size of the shapes", noColumns: "The table has no columns yet; add some under Specimens.",
       checks: "Checks before the run", levels: { ok: "OK", warning: "Warning", problem: "Problem" }, checking: "Checking",
-      paper: "Text for the paper", copyPaper: "Copy the text", findings: "Result", figures: "Figures (SVG, PDF, PNG)", none: "Bring the specimens into correspondence first, or fit new scans.",
+      paper: "Text for the paper", copyPaper: "Copy the text", findings: "Result", figures: "Figures (SVG, PDF, PNG)", none: "Place or import landmarks on the scans, bring the specimens into correspondence, or fit new scans first.",
       hints: {
         compare: "Test whether shape is associated with sex, age, treatment or any other column.", change: "Measure the change between visits of the same subjects in millimetres.",
         asymmetry: "Compare left with right: a score for each subject, and a map.", regress: "Predict a number, such as age, from shape, or the mean shape along such a number.",

@@ -11,10 +11,14 @@
   const Button = ({ strong, small, testid, edits, children, class: extra = "", ...rest }) => edits && Studio.state.read_only ? null : html`
     <button type="button" class=${`${strong ? "strong" : ""} ${small ? "small" : ""} ${extra}`} data-testid=${testid} ...${rest}>${children}</button>`;
 
-  /** A modal dialog; Escape closes it. */
+  /** A modal dialog; Escape closes it. The focus goes back to the button that opened it. */
   function Dialog({ title, testid, onclose, children, wide }) {
     const ref = useRef(null);
-    useEffect(() => { ref.current.showModal(); }, []);
+    useEffect(() => {
+      const opener = document.activeElement;
+      ref.current.showModal();
+      return () => opener.focus({ preventScroll: true });
+    }, []);
     return html`<dialog ref=${ref} class=${wide ? "wide" : ""} aria-label=${title} data-testid=${testid} onclose=${onclose}><h2>${title}</h2>${children}</dialog>`;
   }
 
@@ -93,7 +97,7 @@
         <div class="row path">
           <label for="folder-path">${T.folders.path}</label>
           <input id="folder-path" data-testid="folder-path" value=${typed} oninput=${(event) => setTyped(event.target.value)}
-            onkeydown=${(event) => { if (event.key === "Enter") go(typed); }} />
+            onkeydown=${(event) => { if (event.key === "Enter" && !event.isComposing) go(typed); }} />
           <${Button} testid="folder-go" onclick=${() => go(typed)}>${T.folders.go}<//>
         </div>
         ${error && html`<p class="problem" role="alert">${error}</p>`}

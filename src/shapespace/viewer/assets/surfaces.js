@@ -3,14 +3,15 @@
   "use strict";
 
   const Viewer = window.ShapespaceViewer;
-  const { h, save, alertUser, guarded } = Viewer;
+  const { save, alertUser, guarded } = Viewer;
+  const { make: h } = Shapespace.widgetParts;
   const WORDS = { unreadable: "unreadable", excluded: "excluded", doubtful: "doubtful", look: "needs review", converged: "converged" };
   const DOTS = { unreadable: "unreadable", excluded: "failed", doubtful: "doubtful", look: "doubtful", converged: "converged" };
 
   const percent = (share) => `${(100 * share).toFixed(share > 0 && share < 0.0995 ? 1 : 0)} %`;
 
   /**
-   * Show the surfaces at the address `base` in `root`; return {dispose(), place(), setLandmarks(list)}.
+   * Show the surfaces at the address `base` in `root`; return {dispose(), place(), oriented(), setLandmarks(list)}.
    * options: {landmarks: [{name, vertex}], onvertex(vertex), onlandmark(name, vertex), onplace(), place, onready()}.
    */
   Viewer.openSurfaces = function (root, base, options) {
@@ -29,6 +30,7 @@
     let colour = "squares";
     let sides = 2; // views of each surface, the second from the opposite side
     let faults = new Map(); // name of a scan of the page -> {places, arrays}
+    let turned = null; // rows of the rotation from the frame of the folder to the views
     let turn = 0; // a page that is still on its way is not shown when another was asked for
 
     // The grid --------------------------------------------------------------------------------------------------------
@@ -318,8 +320,10 @@
     async function begin() {
       about = await json("api/about");
       $("about").textContent = `${about.corresponding} of ${about.scans} scans in correspondence, ${about.vertices.toLocaleString("en")} vertices`;
-      mean = (await binary("api/mean")).arrays;
+      const { arrays, facts: { turn: upright } } = await binary("api/mean");
       if (disposed) return;
+      mean = arrays;
+      turned = upright;
       marks = numbersOf(wantedPlace.vertices).filter((vertex) => vertex < about.vertices);
       makeCells();
       put(cells[0], "Mean shape", mean);
@@ -365,6 +369,7 @@
         for (const cell of cells) for (const view of [cell.view, cell.back]) view.dispose();
       },
       place: () => (cells.length ? { camera: Viewer.cameraOf(cells[0].view), first: first || "", vertices: marks.join(","), colour: colour === "squares" ? "" : colour } : wantedPlace),
+      oriented: () => ({ view: cells[0].view, turn: turned }),
       setLandmarks(list) {
         named = list;
         drawAllMarks();

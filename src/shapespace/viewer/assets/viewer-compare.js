@@ -3,13 +3,14 @@
   "use strict";
 
   const Viewer = window.ShapespaceViewer;
-  const { h, sign, paintTrack, nice, quantile, guarded, csvRows } = Viewer;
+  const { guarded, csvRows } = Viewer;
+  const { make, signed, morph, randomShape } = Shapespace.widgetParts;
 
   /** The tab of `page`, see `Viewer.openModel`. */
   Viewer.makeCompareTab = function (page) {
     const { $ } = page;
-    let walking = 0;
-    let positions; // of the vertices, written anew by each shape
+    let walk = null;
+    let pair; // both shapes, and their coefficients as far as the model has them
 
     function fillChoices() {
       page.shapes.set("mean", { name: "the mean shape", z: [] });
@@ -17,104 +18,44 @@
       for (const row of page.fits) if (row.z) page.shapes.set(`fit ${row.name}`, { name: row.label, z: row.z });
       for (const [select, first] of [[$("compare-a"), "mean"], [$("compare-b"), "current"]]) {
         const before = select.value || first;
-        select.replaceChildren(...Array.from(page.shapes, ([key, one]) => h("option", { value: key }, one.name)), h("option", { value: "random" }, "a new random shape"));
+        select.replaceChildren(...Array.from(page.shapes, ([key, one]) => make("option", { value: key, text: one.name })), make("option", { value: "random", text: "a new random shape" }));
         select.value = page.shapes.has(before) ? before : first;
       }
-    }
-
-    function pair() {
-      return [$("compare-a"), $("compare-b")].map((select) => page.shapes.get(select.value));
     }
 
     function choose(event) {
       if (event.target.value === "random") {
         const number = Array.from(page.shapes.keys()).filter((key) => key.startsWith("random ")).length + 1;
-        page.shapes.set(`random ${number}`, { name: `random shape ${number}`, z: page.modelTab.randomShape() });
+        page.shapes.set(`random ${number}`, { name: `random shape ${number}`, z: randomShape(page.about.modes) });
         fillChoices();
         event.target.value = `random ${number}`;
       }
-      drawCompare(true);
+      draw();
     }
 
-    /** Where the walk is: both shapes, their coefficients, those in between, and how far along. */
-    function onTheWay() {
-      const [a, b] = pair();
-      const K = page.about.modes, t = Number($("walk").value);
-      const [za, zb] = [a, b].map((one) => {
-        const given = one.z;
-        return Float64Array.from({ length: K }, (_, k) => given[k] || 0);
+    /** Show both shapes, which were chosen or changed. */
+    function draw() {
+      const { about, model } = page, K = about.modes;
+      pair = [$("compare-a"), $("compare-b")].map((select) => {
+        const { name, z } = page.shapes.get(select.value);
+        return { name, z: Float64Array.from({ length: K }, (_, k) => z[k] || 0) };
       });
-      return { a, b, za, zb, t, K, now: za.map((value, k) => value + t * (zb[k] - value)) };
-    }
-
-    function drawCompare(changed) {
-      const { about, model, stage } = page;
-      if (page.shown !== "compare") return;
-      const { a, b, za, zb, t, K, now } = onTheWay();
-      const from = $("difference").checked ? model.vertices(za).slice() : null;
-      positions = model.vertices(now, positions);
-      if (stage.holds !== "compare") {
-        stage.clear();
-        stage.split(false);
-        stage.holds = "compare";
-        stage.a.setSurface("model", { positions, faces: model.faces, colour: Shapespace.colours.clay });
-      } else {
-        stage.a.move("model", positions);
-      }
-      if (from) {
-        const values = Float32Array.from({ length: model.V }, (_, v) =>
-          Math.hypot(positions[3 * v] - from[3 * v], positions[3 * v + 1] - from[3 * v + 1], positions[3 * v + 2] - from[3 * v + 2]));
-        const range = [0, differenceRange(za, zb)];
-        stage.a.paint("model", values, { map: Shapespace.colours.sequential, range, changed: true });
-        stage.bar({ map: Shapespace.colours.sequential, range, unit: "mm", title: `Moved from ${a.name}` });
-      } else {
-        stage.a.paint("model", null);
-        stage.bar(null);
-      }
-      $("walk-value").textContent = `${Math.round(100 * t)} %`;
-      paintTrack($("walk"));
-      stage.captions(t === 0 ? a.name : t === 1 ? b.name : `${Math.round(100 * t)} % of the way to ${b.name}`);
-      if (!changed) return;
-      const steps = za.map((value, k) => zb[k] - value);
+      walk.draw(true);
+      const [za, zb] = pair.map(({ z }) => z), steps = za.map((value, k) => zb[k] - value);
       // By what it moves on the surface: a faint mode may be many standard deviations off and move nothing.
-      const moved = Float64Array.from(steps, (value, k) => Math.abs(value * about.stddev[k]) / Math.sqrt(model.V));
-      const apart = Math.hypot(...moved);
-      const most = moved.reduce((best, value, k) => (value > moved[best] ? k : best), 0);
+      const moved = steps.map((value, k) => Math.abs(value * about.stddev[k]) / Math.sqrt(model.V));
+      const apart = Math.hypot(...moved), most = moved.indexOf(Math.max(...moved));
       const facts = [
         ["Apart", `${apart.toFixed(2)} mm (RMS over the vertices)`],
         ["", `${Math.hypot(...steps).toFixed(2)} standard deviations`],
-        ["Most in", apart > 0 ? `mode ${most + 1}: it moves ${moved[most].toFixed(2)} mm, at ${sign(steps[most])} standard deviations` : "no mode; they are equal"],
+        ["Most in", apart > 0 ? `mode ${most + 1}: it moves ${moved[most].toFixed(2)} mm, at ${signed(steps[most], 2)} standard deviations` : "no mode; they are equal"],
       ];
-      $("compare-facts").replaceChildren(...facts.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
-      Viewer.coefficientChart($("compare-chart"), [{ z: Array.from(za), name: "from" }, { z: Array.from(zb), name: "to" }], K);
+      $("compare-facts").replaceChildren(...facts.flatMap(([name, text]) => [make("dt", { text: name }), make("dd", { text })]));
+      Viewer.coefficientChart($("compare-chart"), [{ z: za, name: "from" }, { z: zb, name: "to" }], K);
     }
 
-    function differenceRange(za, zb) {
-      const { model } = page;
-      const a = model.vertices(za).slice(), b = model.vertices(zb);
-      const values = Float32Array.from({ length: model.V }, (_, v) =>
-        Math.hypot(a[3 * v] - b[3 * v], a[3 * v + 1] - b[3 * v + 1], a[3 * v + 2] - b[3 * v + 2]));
-      return nice(Math.max(quantile(values, 0.995), 0.1));
-    }
-
-    function stopWalk() {
-      cancelAnimationFrame(walking);
-      walking = 0;
-      $("walk-play").setAttribute("aria-pressed", "false");
-      $("walk-play").textContent = "Play";
-    }
-
-    function startWalk() {
-      $("walk-play").setAttribute("aria-pressed", "true");
-      $("walk-play").textContent = "Stop";
-      const began = performance.now(), phase = Math.acos(1 - 2 * Number($("walk").value));
-      const step = (now) => {
-        $("walk").value = 0.5 - 0.5 * Math.cos(phase + ((now - began) / 1000) * 1.6);
-        drawCompare(false);
-        walking = requestAnimationFrame(step);
-      };
-      walking = requestAnimationFrame(step);
-    }
+    const at = (value) => pair[0].z.map((from, k) => from + ((value + 1) / 2) * (pair[1].z[k] - from));
+    const words = (value) => (!pair ? "" : value <= -1 ? pair[0].name : value >= 1 ? pair[1].name : `${Math.round(50 + 50 * value)} % of the way to ${pair[1].name}`);
 
     const readCsv = guarded(async (file) => {
       const { about } = page;
@@ -156,20 +97,18 @@
 
     function start() {
       fillChoices();
+      walk = morph(page.model, { stage: page.stage, controls: $("compare-walk"), at, words, ends: ["From", "To"], label: "Walk" });
       for (const id of ["compare-a", "compare-b"]) $(id).addEventListener("change", choose);
-      $("walk").addEventListener("input", () => { stopWalk(); drawCompare(false); });
-      $("walk-play").addEventListener("click", () => (walking ? stopWalk() : startWalk()));
-      $("walk-use").addEventListener("click", () => page.apply(onTheWay().now));
-      $("difference").addEventListener("change", () => drawCompare(false));
+      $("walk-use").addEventListener("click", () => page.apply(walk.now()));
       $("swap").addEventListener("click", () => {
         const [a, b] = [$("compare-a").value, $("compare-b").value];
         [$("compare-a").value, $("compare-b").value] = [b, a];
-        drawCompare(true);
+        draw();
       });
       $("csv-button").addEventListener("click", () => $("csv-file").click());
       $("csv-file").addEventListener("change", () => { if ($("csv-file").files[0]) readCsv($("csv-file").files[0]); $("csv-file").value = ""; });
     }
 
-    return { start, draw: drawCompare, stop: stopWalk, fillChoices };
+    return { start, draw, stop: () => walk?.stop(), fillChoices };
   };
 })();

@@ -3,7 +3,8 @@
   "use strict";
 
   const Viewer = window.ShapespaceViewer;
-  const { h, guarded } = Viewer;
+  const { guarded } = Viewer;
+  const { make: h, button, slider, animation, fit: showFit } = Shapespace.widgetParts;
   const FILTERED_FROM = 12;
   const STATUS = {
     converged: "No problems detected", doubtful: "Do not trust this fit", max_iterations: "The fit was cut off",
@@ -46,10 +47,78 @@
     return row.scan_to_model_mm === null ? row.status : `${row.scan_to_model_mm.toFixed(2)} mm`;
   }
 
+  /** The saved iterations of `fit`, on the model of `page`: their element, and update(state) and stop(); null without them. */
+  function makeIterations(fit, { arrays }, { model, about }) {
+    const { history_b: b, history_T: T, history_phase: phases, history_iteration: numbers, history_rms_mm: rms } = arrays;
+    const n = phases ? phases.length : 0, K = arrays.b.length, to = new Float32Array(3 * model.V);
+    if (n < 2) return null;
+
+    /** The model's vertices at an iteration, in the frame of the final pose. */
+    function positionsAt(index) {
+      const from = model.vertices(Array.from({ length: Math.min(model.K, K) }, (_, k) => b[index * K + k] / about.stddev[k])), t = 12 * index;
+      for (let i = 0; i < from.length; i += 3) {
+        for (let r = 0; r < 3; r++) {
+          to[i + r] = T[t + 4 * r] * from[i] + T[t + 4 * r + 1] * from[i + 1] + T[t + 4 * r + 2] * from[i + 2] + T[t + 4 * r + 3];
+        }
+      }
+      return to;
+    }
+
+    const goTo = (index) => fit.showMoment({ index, positions: positionsAt(index), caption: `Phase ${phases[index]}, iteration ${numbers[index]}: RMS ${rms[index].toFixed(2)} mm` });
+    const moments = slider({ label: "Iteration", min: 0, max: n - 1, step: 1, value: n - 1, show: (index) => `${index + 1} / ${n}`, testid: "fit-moment", input: (index) => { stop(); goTo(index); } });
+    const { toggle, stop } = animation(moments.row, () => {
+      const now = fit.state.moment?.index ?? n - 1, from = now < n - 1 ? now : 0, pause = Math.max(0.04, Math.min(0.25, 6 / n)); // s
+      return (seconds) => {
+        const index = Math.min(n - 1, from + Math.floor(seconds / pause));
+        if (index !== fit.state.moment?.index) goTo(index);
+        return index === n - 1;
+      };
+    }, "Play the fit", "fit-play");
+    const chart = h("div");
+    return {
+      stop,
+      element: h("div", {}, h("h2", { text: "Iterations" }), moments.row, h("div", { class: "row" }, toggle), chart),
+      update(state) {
+        if (!state.moment) stop();
+        moments.put(state.moment?.index ?? n - 1);
+        Viewer.rmsChart(chart, Array.from(rms), Array.from(phases), moments.get());
+      },
+    };
+  }
+
   /** The tab of `page`, see `Viewer.openModel`. */
   Viewer.makeFitsTab = function (page) {
     const { $ } = page;
     let selected = -1;
+    let fit = null, steps = null; // what is drawn of the selected one
+    let wanted = { layout: "overlay", colour: "plain" }; // as the user chose for the last one
+
+    function stop() {
+      steps?.stop();
+    }
+
+    /** Draw the fit of a row, with its controls and exports in `detail`. */
+    function open(row, payload, detail) {
+      const { about } = page, { facts, arrays } = payload, { b_stddev } = arrays, z = Array.from(arrays.z), controls = h("div", { class: "ss-controls" }), chart = h("div");
+      const heading = h("h2", { "data-testid": "fit-exported" });
+      const onchange = (state) => {
+        wanted = state;
+        steps?.update(state);
+        heading.textContent = `Export the ${state.stage === "dense" ? "dense" : "fitted"} surface`;
+      };
+      fit = showFit(payload, { stage: page.stage, controls, wanted, onchange });
+      steps = makeIterations(fit, payload, page);
+      const surface = (kind) => {
+        const isDense = fit.state.stage === "dense";
+        return page.download({ fit: row.name, stage: isDense ? "dense" : "final" }, kind, `${facts.name}.${isDense ? "dense" : "fitted"}`);
+      };
+      const name = facts.name.replace(/\.[^.]*$/, ""), error = Array.from(b_stddev, (sd, k) => sd / about.stddev[k]);
+      detail.append(controls, ...[steps?.element, chart, heading].filter(Boolean), h("div", { class: "row" },
+        ...page.exportButtons("fit-export", surface, { name, status: facts.status, b: Array.from(arrays.b), z, sd: Array.from(b_stddev) }),
+        button("Use in Model", () => page.apply(z), { "data-testid": "fit-use" })));
+      Viewer.coefficientChart(chart, [{ z, error }], arrays.b.length);
+      steps?.update(fit.state);
+    }
 
     async function start(name) {
       $("tab-fits").hidden = !page.about.has_fits;
@@ -112,8 +181,8 @@
       $("fit-list").setAttribute("aria-activedescendant", `fit-${index}`);
       $(`fit-${index}`).scrollIntoView({ block: "nearest" });
       const detail = h("div");
-      page.fitView.clear();
-      page.fitView.element = detail;
+      stop();
+      fit = steps = null;
       $("fit-detail").replaceChildren(...[verdictCard(row), distanceFacts(row), detail].filter(Boolean));
       if (!row.pictured) {
         if (row.why_not) $("fit-detail").append(h("p", {}, row.why_not));
@@ -126,19 +195,20 @@
       try {
         const payload = await Viewer.binary(`${page.base}api/fits/${encodeURIComponent(row.name)}`);
         if (selected !== index) return;
-        page.fitView.show(payload, { fit: row.name });
+        if (page.shown === "fits") open(row, payload, detail);
       } finally {
         $("loading").hidden = true;
       }
     });
 
     function draw() {
-      if (page.fits.length && !page.fitView.payload) return selectFit(selected >= 0 ? selected : firstFit());
-      if (page.fitView.payload) page.fitView.draw(true);
-      else page.stage.faintMean();
-      return null;
+      if (!fit) page.stage.take(null);
+      if (!page.fits.length) return page.stage.nothing("There are no fits");
+      if (!fit) return selectFit(selected >= 0 ? selected : firstFit());
+      fit.draw();
+      return fit.frame();
     }
 
-    return { start, draw, name: () => page.fits[selected]?.name };
+    return { start, draw, stop, name: () => page.fits[selected]?.name };
   };
 })();

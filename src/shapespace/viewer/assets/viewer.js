@@ -3,7 +3,8 @@
   "use strict";
 
   const Viewer = window.ShapespaceViewer;
-  const { save, guarded } = Viewer;
+  const { save, guarded, post } = Viewer;
+  const { make, button, Stage, modes } = Shapespace.widgetParts;
   const TABS = ["model", "compare", "fits"];
   const ROOM = 1.2; // of the mean shape in the picture, as other shapes are larger in some directions
 
@@ -17,8 +18,18 @@
     return z;
   }
 
+  /** The picture of a stage as PNG; two views are side by side. */
+  async function picture({ views }) {
+    const blobs = await Promise.all(views.map((view) => view.png()));
+    if (blobs.length === 1) return blobs[0];
+    const images = await Promise.all(blobs.map((blob) => createImageBitmap(blob)));
+    const canvas = make("canvas", { width: images[0].width + images[1].width, height: Math.max(images[0].height, images[1].height) });
+    images.forEach((image, k) => canvas.getContext("2d").drawImage(image, k * images[0].width, 0));
+    return new Promise((resolve) => canvas.toBlob(resolve, "image/png"));
+  }
+
   /**
-   * Show the model at the address `base`, and its fits, in `root`; return {dispose(), place()}.
+   * Show the model at the address `base`, and its fits, in `root`; return {dispose(), place(), oriented()}.
    * options: {place, onplace(), onready()}.
    */
   Viewer.openModel = function (root, base, options) {
@@ -26,48 +37,51 @@
     const wanted = options.place || {};
     /** The state that the tabs share; `begin` fills in what the server sends. */
     const page = {
-      $, base, show, apply,
+      $, base, show, apply, download, exportButtons,
       onplace: () => { if (page.stage) options.onplace?.(); },
       about: null, // facts of the model
       model: null,
-      share: null, // of the variance, of each mode
       z: null, // all coefficients of the shape in Model, standard deviations
       stage: null,
       shown: "model", // name of the tab
       shapes: new Map(), // those to compare: key -> {name, z}
       fits: [], // rows of the saved fits
-      fitView: null, // the fit that is drawn in Fits
     };
-    page.modelTab = Viewer.makeModelTab(page);
     page.compareTab = Viewer.makeCompareTab(page);
     page.fitsTab = Viewer.makeFitsTab(page);
-    const { modelTab, compareTab, fitsTab } = page;
+    const { compareTab, fitsTab } = page;
+    let modelTab = null;
     let isChosen = Boolean(wanted.tab); // whether the user chose a tab before the fits were there
     let disposed = false;
 
     /** Show a tab; return when it is drawn. */
     function show(name) {
-      let drawn = null;
       page.shown = name;
-      modelTab.stop();
-      compareTab.stop();
+      stop();
       for (const tab of TABS) {
         $(`tab-${tab}`).setAttribute("aria-selected", String(tab === name));
         $(`tab-${tab}`).tabIndex = tab === name ? 0 : -1;
         $(tab).hidden = tab !== name;
       }
-      page.fitView.stop();
-      page.fitView.active = name === "fits";
-      if (name === "model") modelTab.draw();
-      else if (name === "compare") compareTab.draw(true);
-      else {
-        page.stage.clear();
-        page.stage.split(false);
-        drawn = fitsTab.draw();
-      }
+      const drawn = { model: modelTab, compare: compareTab, fits: fitsTab }[name].draw();
       if (name !== "fits") page.stage.a.frame(["model"], ROOM);
       page.onplace();
       return drawn;
+    }
+
+    function stop() {
+      for (const tab of [modelTab, compareTab, fitsTab]) tab?.stop();
+    }
+
+    async function download(question, kind, name) {
+      const answer = await Viewer.ask(`${base}api/export?format=${kind}`, post(question));
+      save(await answer.blob(), `${name.replace(/[^\w.-]+/g, "_").replace(/\.(ply|obj|stl|off|vtk|vtp|glb|gltf)(?=\.|$)/i, "")}.${kind}`);
+    }
+
+    /** Buttons that save a surface, by surface(kind), and the coefficients of `row`, see `Viewer.coefficientsCsv`. */
+    function exportButtons(testid, surface, row) {
+      const kinds = page.about.exports.map((kind) => button(kind.toUpperCase(), guarded(() => surface(kind)), { "data-testid": `${testid}-${kind}` }));
+      return [...kinds, button("Coefficients CSV", () => save(Viewer.coefficientsCsv([row], page.about.modes), `${row.name}.coefficients.csv`), { "data-testid": `${testid}-csv` })];
     }
 
     function apply(values) {
@@ -88,7 +102,7 @@
         });
       }
       $("view-home").addEventListener("click", () => page.stage.a.reset());
-      $("picture").addEventListener("click", guarded(async () => save(await page.stage.picture(), "shapespace.png")));
+      $("picture").addEventListener("click", guarded(async () => save(await picture(page.stage), "shapespace.png")));
     }
 
     async function begin() {
@@ -96,16 +110,19 @@
       const unpacked = await Viewer.binary(`${base}api/model`);
       if (disposed) return;
       const model = new Shapespace.Model(unpacked);
-      Object.assign(page, { about, model, share: unpacked.arrays.share, z: coefficientsOf(wanted.z, about.modes) });
-      page.stage = new Viewer.Stage(page);
-      $("about").textContent = `${about.model}: ${about.vertices.toLocaleString("en")} vertices, ${about.modes} ${about.modes === 1 ? "mode" : "modes"}`;
-      page.fitView = new Viewer.FitView($("fit-detail"), { stage: page.stage, model, about, apply, download: modelTab.download });
-      window.shapespaceStage = page.stage;
-      modelTab.start();
+      const z = coefficientsOf(wanted.z, about.modes), stage = new Stage($("stage"), false);
+      Object.assign(page, { about, model, z, stage });
+      stage.panes.append($("tools"));
+      window.shapespaceStage = stage;
+      const unsent = about.modes_sent < about.modes ? `, of which the first ${about.modes_sent} are shown; more would not fit here` : "";
+      $("about").textContent = `${about.model}: ${about.vertices.toLocaleString("en")} vertices, ${about.modes} ${about.modes === 1 ? "mode" : "modes"}${unsent}`;
+      modelTab = modes(unpacked, { stage, controls: $("model-controls"), model, z, onchange: page.onplace });
+      const shape = { name: "shape", get z() { return Array.from(z); }, get b() { return Array.from(z, (value, k) => value * about.stddev[k]); } };
+      $("export-shape").append(...exportButtons("export", (kind) => download({ z: shape.z }, kind, "shape"), shape));
       compareTab.start();
       startTabs();
       modelTab.draw();
-      page.stage.a.frame(["model"], ROOM);
+      stage.a.frame(["model"], ROOM);
       $("loading").hidden = true;
       await fitsTab.start(wanted.fit);
       if (disposed) return;
@@ -130,12 +147,10 @@
     return {
       dispose() {
         disposed = true;
-        modelTab.stop();
-        compareTab.stop();
-        if (!page.stage) return;
-        page.fitView.stop();
-        page.stage.dispose();
+        stop();
+        page.stage?.dispose();
       },
+      oriented: () => ({ view: page.stage.a, turn: null }),
       place: () => (page.stage ? { tab: page.shown, z: textOf(page.z), fit: page.shown === "fits" ? fitsTab.name() || "" : "", camera: Viewer.cameraOf(page.stage.a) } : wanted),
     };
   };

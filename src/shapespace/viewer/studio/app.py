@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import threading
+import time
 import zipfile
 from collections.abc import AsyncGenerator, Callable, Generator, Mapping
 from contextlib import ExitStack, aclosing, suppress
@@ -22,13 +23,14 @@ from starlette.routing import Mount, Route
 from starlette.types import ASGIApp
 
 from shapespace.batch.result_folder import LOCK, only_writer
-from shapespace.correspondence.odd_scans import OddScan, ScanMeasures, find_odd_scans
+from shapespace.correspondence.odd_scans import OddScan, ScanMeasures, find_mirrored_scans, find_odd_scans
 from shapespace.errors import FileError, InputError
 from shapespace.io.containers.json_files import plain_json
 from shapespace.io.files import atomic_path
 from shapespace.io.landmarks.configuration_io import CONFIGURATION_ENDINGS
 from shapespace.io.meshes.mesh_io import MESH_ENDINGS, MESH_FILE_ENDINGS
 from shapespace.io.volume_io import VOLUME_ENDINGS
+from shapespace.reprs import first_names
 from shapespace.schemas import read
 from shapespace.types import MM_PER_UNIT
 from shapespace.version import __version__
@@ -58,7 +60,8 @@ from shapespace.viewer.studio.job_commands import (
     stored_volumes,
 )
 from shapespace.viewer.studio.jobs import Job, Jobs, Order, history
-from shapespace.viewer.studio.landmark_import import is_landmark_table, points_of_file
+from shapespace.viewer.studio.landmark_import import is_landmark_table, read_points
+from shapespace.viewer.studio.placed_landmarks import PLACED
 from shapespace.viewer.studio.project import (
     PastedBlock,
     Project,
@@ -77,6 +80,10 @@ from shapespace.viewer.studio.views import Views, result_path, view_kinds
 _VOLUME_ENDINGS = tuple(ending for ending in VOLUME_ENDINGS if ending != ".mhd")  # whose data are in another file
 _TABLE_BYTES, _REQUEST_BYTES = 2**24, 2**20
 _EVENT_S = 0.4  # between events
+_MIRRORED = (
+    "Probably a mirror image of most others, such as a left one among right ones; mirror it under Specimens if so."
+)
+_BESIDE = 0.1  # of the extent of a scan, from which on a landmark is not on it
 _MOST_LISTED = 2000  # folders and files of a listing
 
 
@@ -108,6 +115,7 @@ class OpenProject:
         self._forms = forms
         self._outdated: tuple[object, dict[int, Outdated]] = (None, {})
         self._odd: tuple[object, dict[str, OddScan]] = (None, {})
+        self._mirrored: tuple[object, list[str]] = (None, [])
         for resource in (self.views, self.checks, self.jobs):
             self._resources.callback(resource.close)
 
@@ -151,6 +159,50 @@ class OpenProject:
             self._odd = key, {key[k][0]: odd for k, odd in found.items()}
         return self._odd[1]
 
+    def mirrored_scans(self) -> list[str]:
+        """Return the ids of the specimens for training that are probably mirror images of most others.
+
+        It takes 20 ms per specimen, once for a set of scans.
+        """
+        project, odd = self.project, self.odd_scans()
+        chosen = [
+            specimen
+            for specimen in project.state.chosen("training")
+            if specimen.id not in odd or odd[specimen.id].shape_ratio == 1.0
+        ]
+        key = [
+            (specimen.id, specimen.mirrored, scan_key(project.path(specimen), project.folder)) for specimen in chosen
+        ]
+        if key != self._mirrored[0]:
+            samples = {
+                specimen.id: self.checks.sample(project.path(specimen), mirrored=specimen.mirrored)
+                for specimen in chosen
+            }
+            known = {name: sample for name, sample in samples.items() if sample is not None}
+            self._mirrored = key, [list(known)[k] for k in find_mirrored_scans(list(known.values()))]
+        return self._mirrored[1]
+
+    def landmarks_off_scans(self) -> dict[str, str]:
+        """Return a sentence on each specimen with landmarks outside of the box around its scan, by its id."""
+        found, facts = dict[str, str](), self._checked()
+        for specimen in self.project.state.specimens:
+            box = facts.get(specimen.id, {}).get("box")
+            if box is None or not specimen.points:
+                continue
+            low, high = np.array(box)
+            beside = np.abs(np.array([*specimen.points.values()]) - (low + high) / 2) - (high - low) / 2
+            off = [
+                name
+                for name, far in zip(specimen.points, beside, strict=True)
+                if far.max() > _BESIDE * (high - low).max()
+            ]
+            if off:
+                names = first_names(off)
+                found[specimen.id] = (
+                    f"{specimen.id}: not on its scan: {names}; check the unit and axes of the landmarks."
+                )
+        return found
+
     def scan_contents(self) -> dict[str, str]:
         """Return the hash of the scan of each specimen by its id; scans that were not checked yet are read for it."""
         contents = _contents_of(self._checked())
@@ -189,6 +241,8 @@ class OpenProject:
             "notes": state.notes(), "counts": state.counts(),
             "undo": project.undo_text, "redo": project.redo_text, "landmarks": state.landmarks,
             "landmarks_on": state.landmarks_on, "point_names": list(state.point_names),
+            "views": to_builtins(state.views),
+            "curves": to_builtins(state.curves), "pairs": state.mirrored_pairs,
             "jobs": [self._job(job) for job in jobs],
         }  # fmt: skip
 
@@ -251,7 +305,7 @@ class Studio:
         self._forms, self._labels = forms, OptionLabels(forms)
         self._upload_bytes = upload_bytes
         self._read_only = read_only
-        self._changes = 0
+        self._changes, self._state_s = 0, 0.0  # and the seconds that the last state took
         self._open: OpenProject | None = None
         self._lock = threading.RLock()
         if folder is not None:
@@ -334,7 +388,8 @@ class Studio:
     # The state
 
     def _state(self, request: Request) -> Response:
-        return json_response(
+        began = time.monotonic()
+        response = json_response(
             {
                 "version": __version__, "project": None if self._open is None else self._open.facts(),
                 "recent": recent_projects(), "formats": list(MESH_ENDINGS),
@@ -343,6 +398,8 @@ class Studio:
                 "units": list(MM_PER_UNIT), "read_only": self._read_only,
             }
         )  # fmt: skip
+        self._state_s = time.monotonic() - began
+        return response
 
     async def _events(self, request: Request) -> Response:
         async def stream() -> AsyncGenerator[str]:
@@ -351,7 +408,9 @@ class Studio:
                 if sent != self._changes:
                     sent = self._changes
                     yield f"data: {json.dumps({'revision': sent})}\n\n"
-                await asyncio.sleep(_EVENT_S)
+                await asyncio.sleep(
+                    max(_EVENT_S, 2.0 * self._state_s)
+                )  # so that most of the time is for other requests
 
         return StreamingResponse(stream(), media_type="text/event-stream")
 
@@ -409,7 +468,9 @@ class Studio:
         if not name.lower().endswith(_VOLUME_ENDINGS):
             raise HTTPException(415, f"{name} is not a volume that can be read; drop {', '.join(_VOLUME_ENDINGS)}.")
         target = await self._store(request, name)
-        return json_response({"file": target.relative_to(self._project.project.folder).as_posix()}, 201)
+        kept = await run_in_threadpool(self._project.project.keep_volume, target)
+        same_as = None if kept == target else kept.name
+        return json_response({"file": f"{kept.parent.name}/{kept.name}", "same_as": same_as}, 201)
 
     async def _labels_of_volume(self, request: Request) -> Response:
         content = await json_body(request, _REQUEST_BYTES)
@@ -473,9 +534,11 @@ class Studio:
 
     async def _take_landmarks(self, content: bytes, name: str) -> Response:
         project = self._project.project
-        names, points, notes = await run_in_threadpool(points_of_file, content, name, project.state)
-        await run_in_threadpool(project.edit, None, with_points(names, points), together="import landmarks")
+        names, points, curves, notes = await run_in_threadpool(read_points, content, name, project.state)
+        await run_in_threadpool(project.edit, None, with_points(names, points, curves), together="import landmarks")
         self._changed()
+        off = await run_in_threadpool(self._project.landmarks_off_scans)
+        notes += [text for name, text in off.items() if name in points]
         return json_response({"matched": len(points), "landmarks": len(names), "notes": notes})
 
     async def _match_block(self, request: Request) -> Response:
@@ -509,12 +572,16 @@ class Studio:
         opened, shapes = self._project, None
         if kind in QUESTIONS:
             try:
-                shapes = shapes_of(opened.jobs.all(), kind, on)
+                shapes = shapes_of(opened.project, opened.jobs.all(), kind, on)
             except InputError as error:
                 return json_response([{"level": "problem", "text": str(error)}])
         given = cast(dict[str, Any], options) if isinstance(options, dict) else {}
-        odd_scans = opened.odd_scans() if kind == "correspond" else {}
-        odd = [f"{name}: {odd.text}" for name, odd in odd_scans.items()]
+        odd = list[str]()
+        if kind == "correspond":
+            odd = [f"{name}: {odd.text}" for name, odd in opened.odd_scans().items()]
+            odd += [f"{name}: {_MIRRORED}" for name in await run_in_threadpool(opened.mirrored_scans)]
+        elif shapes is not None and shapes.number == PLACED:
+            odd = [*(await run_in_threadpool(opened.landmarks_off_scans)).values()]
         found = await run_in_threadpool(checks, opened.project, self._forms, kind, given, shapes, odd)
         return json_response([{**finding, "text": self._labels.sentence(finding["text"])} for finding in found])
 

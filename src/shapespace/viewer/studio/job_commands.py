@@ -8,30 +8,35 @@ import io
 import os
 import re
 import shutil
+import threading
+import weakref
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from functools import lru_cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, mkdtemp
 from typing import Any, Literal, cast
 
 import numpy as np
+from msgspec.structs import replace
 
 from shapespace.batch.result_folder import names_for
 from shapespace.cohort.read import cohort_file_text
 from shapespace.cohort.table import is_number, list_names
 from shapespace.errors import FileError, InputError, ShapespaceError
-from shapespace.io.files import make_folder
-from shapespace.io.landmarks.configuration_io import CONFIGURATION_FORMATS
+from shapespace.io.containers.json_files import read_json
+from shapespace.io.files import make_folder, write_bytes
+from shapespace.io.landmarks.configuration_io import CONFIGURATION_FORMATS, RECORD
 from shapespace.io.meshes.mesh_io import write_mesh
-from shapespace.io.tables.table_io import DECIMAL_COMMA
+from shapespace.io.tables.table_io import DECIMAL_COMMA, table_text
 from shapespace.io.volume_io import VOLUME_ENDINGS
 from shapespace.model.shape_model import ShapeModel
-from shapespace.schemas import CorrespondenceRecord, CorrespondRecord
+from shapespace.schemas import AlignRecord, CorrespondenceRecord, CorrespondRecord, read
 from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS
 from shapespace.store.results import Results
 from shapespace.types import Mesh
 from shapespace.viewer.studio.jobs import Job, Order
+from shapespace.viewer.studio.placed_landmarks import MISSING_LANDMARKS, PLACED, placed_landmarks
 from shapespace.viewer.studio.project import LANDMARK_COLUMN, Project, Specimen
 
 Forms = Mapping[str, Mapping[str, Any]]
@@ -51,6 +56,7 @@ _INPUTS = "inputs"
 _NAMES = ("name", "files", "ids", "set")
 """Keys of the options of a job that name scans or volumes; all others are options of its command."""
 _MOST_ODD = 5  # findings on single specimens in the checks
+_checking = threading.Lock()  # checks write their tables into the folder of the same small surfaces
 _LEAST_WAYS = 60  # in which small surfaces of a check vary; few, so that the check of many specimens takes no time
 _OF_SURFACES = ("--geometry", "--landmarks", "--length", "--modules", "--pairs", "--region", "--stable")
 """Options that depend on the vertices of surfaces, so that small ones cannot stand for them in a check."""
@@ -142,8 +148,8 @@ def order(
         chosen = _require_specimens(state.chosen("training"), "to bring into correspondence", 2)
         files, prepared = project.scan_list(folder / listed, chosen)
         output = f"correspondence-{number}"
-        keys = _keys_of(chosen, scans)
-        return Order((*words, listed, "-o", output, *given), output, prepared, files=files, scans=keys)
+        words = (*words, listed, "-o", output, *given)
+        return Order(words, output, prepared, files=files, scans=_keys_of(chosen, scans))
     if kind == "redo":
         before = result_of(jobs, CORRESPONDENCES, on)
         name = str(options.get("name", ""))
@@ -151,9 +157,8 @@ def order(
         if not chosen:
             raise InputError(f"There is no specimen {name[:40]!r}; choose one of the list.")
         files, prepared = project.scan_list(folder / listed, chosen)
-        keys = _keys_of(chosen, scans)
         redone = (*words, listed, "--redo", name, "-o", before.output)
-        return Order(redone, before.output, prepared, files=files, scans=keys)
+        return Order(redone, before.output, prepared, files=files, scans=_keys_of(chosen, scans))
     if kind == "surface":
         output = f"surfaces/{number:04d}"
         return Order((*words, *stored_volumes(project, options.get("files")), "-o", output, *given), output)
@@ -209,7 +214,7 @@ def order(
         return Order((*words, fits, *names, "-o", output, *given), output)
     if kind not in QUESTIONS:
         raise InputError(f"There is no action {kind[:30]!r}; reload the page.")
-    return _question(project, shapes_of(jobs, kind, on), forms, kind, options, number)
+    return _question(project, shapes_of(project, jobs, kind, on), forms, kind, options, number)
 
 
 def _export_landmarks(project: Project, words: tuple[str, ...], given: Sequence[str], to: str, number: int) -> Order:
@@ -266,9 +271,19 @@ def groomed_scans(job: Job, folder: Path) -> dict[str, str]:
 
 
 def _question(project: Project, shapes: Job, forms: Forms, kind: str, options: Mapping[str, Any], number: int) -> Order:
-    words, given = forms[kind]["command"], _option_arguments(forms, kind, options)
+    of_command = {flag: value for flag, value in options.items() if flag != MISSING_LANDMARKS}
+    words, given = forms[kind]["command"], _option_arguments(forms, kind, of_command)
     stem, output = f"{_INPUTS}/{number:04d}", f"{kind}-{number}"
-    chosen = _specimens_of(project, shapes)
+    chosen, marks, before = _specimens_of(project, shapes, options), dict[str, str](), ()
+    if shapes.number == PLACED:
+        folder = f"{stem}-landmarks"
+        placed = placed_landmarks(project, options)
+        marks, before = placed.files(folder), (placed.command(folder),)
+        shapes = replace(shapes, output=f"{folder}/aligned")
+        pairs = [pair for pair in project.state.mirrored_pairs if {*pair} <= {*placed.names}]
+        if kind == "asymmetry" and pairs and not (options.get("--pairs") or options.get("--side")):
+            marks[f"{folder}/pairs.csv"] = table_text(pairs[0], pairs[1:])
+            given += ["--pairs", f"{folder}/pairs.csv"]
     if kind == "score":
         reference, others = _by_class(chosen, options.get("--reference"))
         reference_table, population = f"{stem}-reference.csv", f"{stem}-reference.toml"
@@ -282,15 +297,15 @@ def _question(project: Project, shapes: Job, forms: Forms, kind: str, options: M
         given = [word for word in given if not word.startswith("--reference=")]
         return Order(
             (*words, f"{stem}.csv", "--shapes", shapes.output, "--reference", population, "-o", output, *given),
-            output, on=shapes.number, files=files,
+            output, before, on=shapes.number, files=files | marks,
         )  # fmt: skip
-    files = {f"{stem}.csv": project.table(_require_specimens(chosen, "to analyse", 2))}
+    files = {f"{stem}.csv": project.table(_require_specimens(chosen, "to analyse", 2))} | marks
     if options.get("--geometry") == "landmarks" and not options.get("--landmarks") and shapes.kind in CORRESPONDENCES:
         marks = _landmark_files(project, shapes.output, stem)
         files |= marks
         given += [word for name in marks for word in ("--set", f"landmarks={name}")]
     arguments = (*words, f"{stem}.csv", "--shapes", shapes.output, "-o", output, *given)
-    return Order(arguments, output, on=shapes.number, files=files)
+    return Order(arguments, output, before, on=shapes.number, files=files)
 
 
 def _landmark_files(project: Project, surfaces: str, stem: str) -> dict[str, str]:
@@ -310,40 +325,47 @@ def _landmark_files(project: Project, surfaces: str, stem: str) -> dict[str, str
     return {f"{stem}-landmarks.csv": project.landmark_table(surfaces)}
 
 
-def shapes_of(jobs: Sequence[Job], kind: str, on: int | None) -> Job:
-    """Return the job whose shapes a question is about: fits, or surfaces in correspondence if no job is chosen.
+def shapes_of(project: Project, jobs: Sequence[Job], kind: str, on: int | None) -> Job:
+    """Return the job whose shapes a question is about: fits, surfaces in correspondence, or landmarks on scans, with
+    the number `PLACED`. If no job is chosen, it is the newest correspondence, or else the landmarks.
 
     Raises:
         InputError: there is none.
     """
     if kind == "identify":
         return result_of(jobs, ("fit",), on)
+    has_surfaces = any(job.kind in CORRESPONDENCES and job.status == "done" for job in jobs)
+    if on == PLACED or (on is None and not has_surfaces and project.state.point_names):
+        return Job(number=PLACED, kind="landmarks", arguments=(), output="")
     return result_of(jobs, CORRESPONDENCES if on is None else (*CORRESPONDENCES, "fit"), on)
 
 
-def _specimens_of(project: Project, shapes: Job | None) -> Sequence[Specimen]:
+def _specimens_of(project: Project, shapes: Job | None, options: Mapping[str, Any]) -> Sequence[Specimen]:
     """Return the included specimens that a job with shapes has: fits are of new scans."""
+    if shapes is not None and shapes.number == PLACED:
+        placed = placed_landmarks(project, options)
+        return [specimen for specimen in project.state.chosen("training") if specimen.id in placed.points]
     return project.state.chosen("new" if shapes is not None and shapes.kind == "fit" else "training")
 
 
 def _by_class(specimens: Sequence[Specimen], named: Any) -> tuple[Sequence[Specimen], Sequence[Specimen]]:
     """Return the specimens of the class `column=value`, and the others."""
     column, _, value = str(named or "").partition("=")
-    members: list[Specimen] = []
-    others: list[Specimen] = []
-    for specimen in specimens:
-        (members if value and specimen.cells.get(column) == value else others).append(specimen)
-    return members, others
+    members = [specimen for specimen in specimens if value and specimen.cells.get(column) == value]
+    ids = {specimen.id for specimen in members}
+    return members, [specimen for specimen in specimens if specimen.id not in ids]
 
 
 def result_of(jobs: Sequence[Job], kinds: Sequence[str], on: int | None) -> Job:
-    """Return the job `on`, or the newest that succeeded, of some kinds.
+    """Return the job `on`, or the newest that succeeded, of some kinds. `on` may be a correspondence that still runs or
+    waits, for whose end the job that uses it waits.
 
     Raises:
         InputError: there is none.
     """
     for job in reversed(jobs):
-        if job.kind in kinds and job.status == "done" and on in (None, job.number):
+        is_awaited = on == job.number and job.kind in CORRESPONDENCES and job.status in ("waiting", "running")
+        if job.kind in kinds and (job.status == "done" or is_awaited) and on in (None, job.number):
             return job
     missing = {"correspond": "a correspondence", "build": "a model", "fit": "fits of new scans"}
     needed = next((missing[kind] for kind in kinds if kind in missing), "an answer")
@@ -379,124 +401,163 @@ def checks(
         kind: kind of the job.
         options: flag -> value, as sent by the page.
         shapes: job whose shapes a question is about; None for other kinds.
-        odd: sentences on specimens that differ from the others.
+        odd: sentences on specimens that differ from the others, or on landmarks that are not on their scans.
     """
-    listed = chosen = _specimens_of(project, shapes)
+    listed = chosen = _specimens_of(project, shapes, options)
     columns = _used_columns(project.state.columns, options)
     missing = {column: sum(not specimen.cells.get(column) for specimen in chosen) for column in columns}
     of_all = len(chosen)
     drop_missing = options.get("--missing") == "drop"
     if drop_missing:
         chosen = [specimen for specimen in chosen if all(specimen.cells.get(column) for column in columns)]
-    found = [{"level": "ok" if len(chosen) >= 2 else "problem", "text": f"Included specimens: {len(chosen)}."}]
+    found = [("ok" if len(chosen) >= 2 else "problem", f"Included specimens: {len(chosen)}.")]
+    rest = [f"{len(odd) - _MOST_ODD} more specimens like these."] if len(odd) > _MOST_ODD else []
+    found += [("warning", text) for text in (*odd[:_MOST_ODD], *rest)]
     if kind == "correspond":
-        rest = [f"{len(odd) - _MOST_ODD} more specimens differ from the others."] if len(odd) > _MOST_ODD else []
-        return [*found, *({"level": "warning", "text": text} for text in (*odd[:_MOST_ODD], *rest))]
+        return _as_findings(found)
     if shapes is not None and shapes.kind in CORRESPONDENCES:
         there = _surface_files(project, shapes, chosen)
         lacking = [specimen.id for specimen in chosen if specimen.id not in there]
-        if lacking:
-            have = "has no surface" if len(lacking) == 1 else "have no surfaces"
-            text = f"{list_names(lacking)} {have} in {shapes.output} and cannot take part."
-            found.append({"level": "warning" if len(chosen) - len(lacking) >= 2 else "problem", "text": text})
+        have = "has no surface" if len(lacking) == 1 else "have no surfaces"
+        text = f"{list_names(lacking)} {have} in {shapes.output} and cannot take part."
+        found += [("warning" if len(chosen) - len(lacking) >= 2 else "problem", text)] if lacking else []
+    if shapes is not None and shapes.number == PLACED:
+        placed = placed_landmarks(project, options)
+        every, excluded = len(project.state.point_names), len(placed.lacking) - len(placed.points)
+        lacking = [f"{name} {count} of {every}" for name, count in placed.lacking.items() if count]
+        result = f"excluded specimens: {excluded}" if excluded else f"landmarks in use: {len(placed.names)}"
+        text = f"Landmarks are missing ({list_names(lacking)}); {result}. Place them, or see {MISSING_LANDMARKS}."
+        found += [("warning", text)] if lacking else []
     if kind == "score" and options.get("--reference"):
         members, others = map(len, _by_class(chosen, options["--reference"]))
-        level = "problem" if members < 2 or not others else "warning" if members < 20 else "ok"
         text = f"{members} in the reference, {others} to score; percentiles have steps of 1 in {members + 1}."
-        found.append({"level": level, "text": text})
+        found.append(("problem" if members < 2 or not others else "warning" if members < 20 else "ok", text))
     if kind == "regress" and bool(options.get("--target")) == bool(options.get("--along")):
         text = (
-            "Choose one column, by either --target or --along: to predict a number from shape, or shapes from a number."
+            "Choose one column, by either --target or --along: to predict a number from shape, or shapes from a number"
         )
-        found.append({"level": "problem", "text": text})
+        found.append(("problem", f"{text}."))
     for column in columns:
         cells = [specimen.cells.get(column, "") for specimen in chosen]
         if missing[column]:
             what = "these are excluded" if drop_missing else "fill it in, or exclude these with --set missing=drop"
             text = f"{column} is missing for {missing[column]} of {of_all} specimens; {what}."
-            found.append({"level": "warning" if drop_missing else "problem", "text": text})
+            found.append(("warning" if drop_missing else "problem", text))
         classes = {cell: cells.count(cell) for cell in dict.fromkeys(cells) if cell}
         decimals = [cell for cell in classes if DECIMAL_COMMA.fullmatch(cell)]
         if decimals:
             text = f"{column} has numbers with a decimal comma ({list_names(decimals)}); write a decimal point."
-            found.append({"level": "problem", "text": text})
+            found.append(("problem", text))
         elif len(classes) > 2 and all(map(is_number, classes)) and column != options.get("--group"):
             numbers = sorted(map(float, classes))
-            found.append({"level": "ok", "text": f"{column}: numbers from {numbers[0]:g} to {numbers[-1]:g}."})
+            found.append(("ok", f"{column}: numbers from {numbers[0]:g} to {numbers[-1]:g}."))
         elif 0 < len(classes) <= 12:
-            few = min(classes.values()) < 3
             text = f"{column}: {', '.join(f'{count} {name}' for name, count in classes.items())}."
-            found.append({"level": "warning" if few else "ok", "text": text})
+            found.append(("warning" if min(classes.values()) < 3 else "ok", text))
         elif classes:
-            found.append({"level": "ok", "text": f"{column}: {len(classes)} values."})
+            found.append(("ok", f"{column}: {len(classes)} values."))
         if len(classes) == 1:
-            found.append({"level": "problem", "text": f"{column} has one value for all specimens; nothing can differ."})
+            found.append(("problem", f"{column} has one value for all specimens; nothing can differ."))
     for option in forms.get(kind, {}).get("options", ()):
         value = str(options.get(option["flag"]) or "").strip()
-        text = ""
         if option["required"] and not value:
-            text = f"Choose a value of {option['flag']}."
+            found.append(("problem", f"Choose a value of {option['flag']}."))
         elif value and option["kind"] == "number" and not is_number(value):
-            text = f"{option['flag']}: {value[:40]!r} is not a number."
-        if text:
-            found.append({"level": "problem", "text": text})
-    if not any(finding["level"] == "problem" for finding in found):
-        reason = _reason_of_rejection(project, forms, kind, options, shapes, [specimen.id for specimen in listed])
+            found.append(("problem", f"{option['flag']}: {value[:40]!r} is not a number."))
+    if not any(level == "problem" for level, _ in found):
+        names = [specimen.id for specimen in listed]
+        reason, notes = _reason_of_rejection(project, forms, kind, options, shapes, names)
+        found += [("warning", note) for note in notes]
         for column in columns if reason else ():
             is_group = column in (options.get("--group"), options.get("--points"))
             if is_group and len(chosen) == len({specimen.cells.get(column) for specimen in chosen}):
                 reason = f"{column} has another value for each specimen; choose a column of classes."
-        found += [{"level": "problem", "text": reason}] if reason else []
-    return found
+        found += [("problem", reason)] if reason else []
+    return _as_findings(found)
+
+
+def _as_findings(found: Sequence[tuple[str, str]]) -> list[dict[str, str]]:
+    return [{"level": level, "text": text} for level, text in found]
 
 
 def _reason_of_rejection(
     project: Project, forms: Forms, kind: str, options: Mapping[str, Any], shapes: Job | None, names: Sequence[str]
-) -> str:
-    """Return why the command of a question would reject its input; empty if it would not, or cannot be asked.
+) -> tuple[str, Sequence[str]]:
+    """Return why the command of a question would reject its input, empty if it would not, or cannot be asked; and the
+    first notes of the alignment of landmarks.
 
     It is asked with the table, options and fits of the project, and small surfaces of the same names in place of those
     in correspondence, which would take too long to read.
     """
-    shapes = shapes or Job(number=0, kind="correspond", arguments=(), output="shapes")
-    if kind == "power" and re.fullmatch(r"corrected|[\d.]+x", str(options.get("--effect") or "corrected")):
+    shapes = shapes or Job(number=1, kind="correspond", arguments=(), output="shapes")
+    is_of_shapes = re.fullmatch(r"corrected|[\d.]+x", str(options.get("--effect") or "corrected"))
+    if kind == "power" and is_of_shapes and shapes.number != PLACED:
         options = {**options, "--effect": "observed"}  # whether there is such an effect depends on the real surfaces
-    with TemporaryDirectory(prefix="shapespace-check-", ignore_cleanup_errors=True) as name:
-        folder = Path(name)
+    is_placed, is_fit = shapes.number == PLACED, shapes.kind == "fit"
+    with ExitStack() as stack:
         try:
             made = _question(project, shapes, forms, kind, options, 0)
-            made.write_files(folder)
-            if shapes.kind == "fit":
-                (folder / shapes.output).symlink_to(project.folder / shapes.output)
+            if is_placed or is_fit:
+                temporary = TemporaryDirectory(prefix="shapespace-check-", ignore_cleanup_errors=True)
+                folder = Path(stack.enter_context(temporary))
             else:
                 ways = [int(options[flag]) for flag in ("--components", "--modes") if str(options.get(flag)).isdigit()]
-                _write_small_surfaces(project, shapes, names, folder, max(_LEAST_WAYS, *ways, 0))
+                folder = _small_surfaces(project, shapes, names, max(_LEAST_WAYS, *ways, 0))
+                stack.enter_context(_checking)
+            made.write_files(folder)
+            if is_fit:
+                (folder / shapes.output).symlink_to(project.folder / shapes.output)
         except InputError as error:
-            return str(error)
+            return str(error), ()
         except OSError:
-            return ""  # Windows does not allow links to all users
-        way = ["--set", "surfaces=coefficients"] if shapes.kind == "fit" else []
-        is_parsed_only = any(options.get(flag) for flag in _OF_SURFACES)
+            return "", ()  # Windows does not allow links to all users
+        way = ["--set", "surfaces=coefficients"] if is_fit else []
+        is_parsed_only = not is_placed and any(options.get(flag) for flag in _OF_SURFACES)
         folders = [] if is_parsed_only else [folder, project.folder]
-        reason = str(forms[kind]["check"]([*made.arguments, *way], folders))
-        reason = reason.replace(str(folder / next(iter(made.files))), "The table")
-        return reason.replace(f"{folder}{os.sep}", "").replace(f"{project.folder}{os.sep}", "")
+        aligned = [[str(folder / word) if word in made.files else word for word in words] for words in made.before]
+        check, record = forms[kind]["check"], folder / _INPUTS / "0000-landmarks/aligned" / RECORD
+        rejections = [*(str(check(words, [folder])) for words in aligned)]
+        reason = "".join(rejections) or str(check([*made.arguments, *way], folders))
+        notes = read(AlignRecord, read_json(record, ""), str(record), "").notes if record.is_file() else ()
+        texts = [
+            text.replace(str(folder / next(iter(made.files))), "The table")
+            .replace(f"{_INPUTS}/0000-landmarks/pairs.csv", "The pairs of landmarks")
+            .replace(f"{folder}{os.sep}", "")
+            .replace(f"{project.folder}{os.sep}", "")
+            for text in (reason, *notes[:_MOST_ODD])
+        ]
+        return texts[0], texts[1:]
 
 
-def _write_small_surfaces(project: Project, shapes: Job, names: Sequence[str], folder: Path, ways: int) -> None:
-    """Write small symmetric surfaces, which vary in `ways` ways, into `folder`: for each specimen that has one in
+def _small_surfaces(project: Project, shapes: Job, names: Sequence[str], ways: int) -> Path:
+    """Return a folder with small symmetric surfaces, which vary in `ways` ways: for each specimen that has one in
     `shapes`, also if it was excluded, as the record lists it; or for all `names` if `shapes` has no folder."""
+    source = project.folder / shapes.output
+    names = sorted(_surface_names(project, shapes)) if source.is_dir() else names
+    path = source / CorrespondenceRecord.FILE
+    record = path.read_bytes() if path.is_file() else b""
+    return project.cached(
+        (shapes.output, tuple(names), ways, record),
+        lambda: _write_small_surfaces(project, shapes.output, names, ways, record),
+    )
+
+
+def _write_small_surfaces(project: Project, output: str, names: Sequence[str], ways: int, record: bytes) -> Path:
+    """Return a new folder with small surfaces, which is removed with the project's object."""
+    folder = Path(mkdtemp(prefix="shapespace-check-"))
+    weakref.finalize(project, shutil.rmtree, folder, ignore_errors=True)
     rng = np.random.default_rng(0)
     half = rng.normal([4.0, 0.0, 0.0], size=(min(ways, len(names)) // 6 + 6, 3))
     template = np.concatenate([half, half * (-1.0, 1.0, 1.0)])
     triangles = np.arange(len(half) - 2)[:, None] + np.arange(3)
     faces = np.concatenate([triangles, triangles[:, ::-1] + len(half)]).astype(np.int32)
-    source, target = project.folder / shapes.output, make_folder(folder / shapes.output)
-    for name in sorted(_surface_names(project, shapes)) if source.is_dir() else names:
+    target = make_folder(folder / output)
+    for name in names:
         vertices = template + 0.1 * rng.normal(size=template.shape)
         write_mesh(target / f"{name}{CorrespondRecord.SURFACE}", Mesh(vertices, faces))
-    if (source / CorrespondenceRecord.FILE).is_file():
-        shutil.copyfile(source / CorrespondenceRecord.FILE, target / CorrespondenceRecord.FILE)
+    if record:
+        write_bytes(target / CorrespondenceRecord.FILE, record)
+    return folder
 
 
 Outdated = Literal["specimens", "table", "landmarks", "redone", "source"]
@@ -552,9 +613,9 @@ def _change_since(
     try:
         now = order(project, earlier, forms, job.kind, job.options, on, job.number)
     except (InputError, FileError):
-        has_marks = job.kind == "build" or job.options.get("--geometry") == "landmarks"
-        moved = has_marks and bool(sources) and project.state.landmarks_on not in ("", sources[-1].output)
-        return "landmarks" if moved else "specimens"
+        has_marks = job.kind == "build" or job.on == PLACED or job.options.get("--geometry") == "landmarks"
+        moved = bool(sources) and project.state.landmarks_on not in ("", sources[-1].output)
+        return "landmarks" if has_marks and (moved or job.on == PLACED) else "specimens"
     is_each = job.kind in ("correspond", "fit", "complete")  # each scan has a result, also if others are excluded later
     if now.arguments != job.arguments and job.kind != "report":
         are_marked = ["-landmarks.csv" in " ".join(arguments) for arguments in (now.arguments, job.arguments)]
@@ -588,8 +649,10 @@ def _change_since(
             used = frozenset(columns if job.kind == "report" else used)
             rows, rows_before = _rows_of(content, used), _rows_of(before, used)
             if rows != rows_before:
-                is_same = [row[:1] for row in rows] == [row[:1] for row in rows_before]
-                return "table" if is_same else "specimens"
+                others = {row[0] for row in rows} ^ {row[0] for row in rows_before}
+                included = {specimen.id for specimen in project.state.chosen("training")}
+                is_marked = job.on == PLACED and others <= included  # they are used if they have all landmarks
+                return "table" if not others else "landmarks" if is_marked else "specimens"
     return None
 
 
@@ -672,7 +735,9 @@ def _surfaces(project: Project, before: Job) -> list[str]:
 
 
 def _surface_names(project: Project, shapes: Job) -> set[str]:
-    """Return the names of the specimens with a surface in correspondence."""
+    """Return the names of the specimens with a surface in correspondence, also of one that still runs."""
+    if shapes.kind == "correspond" and shapes.status in ("waiting", "running"):
+        return {specimen.id for specimen in project.state.chosen("training")}
     with suppress(FileNotFoundError):
         names = [path.name for path in (project.folder / shapes.output).iterdir()]
         ending = CorrespondRecord.SURFACE

@@ -375,9 +375,13 @@ def history(jobs: list[Job]) -> str:
         'mkdir -p "${1:?Give a new folder for the results.}" && cd "$1" || exit 2',
         'run() { "$@"; code=$?; [ $code -le 1 ] || { echo "This command failed: $*" >&2; exit $code; }; }',
     ]
-    for arguments in (words for job in jobs if job.status == "done" for words in (*job.before, job.arguments)):
+    done = [job for job in jobs if job.status == "done"]
+    made = {words[words.index("-o") + 1] for job in done for words in job.before}
+    for arguments in (words for job in done for words in (*job.before, job.arguments)):
         words = [
-            f'"$PROJECT"/{shlex.quote(word)}' if word.startswith(_OF_PROJECT) else shlex.quote(word)
+            f'"$PROJECT"/{shlex.quote(word)}'
+            if word.startswith(_OF_PROJECT) and word not in made
+            else shlex.quote(word)
             for word in arguments
         ]
         lines.append(" ".join(["run", "shapespace", *words]))

@@ -11,17 +11,19 @@ import re
 import threading
 from collections import Counter
 from collections.abc import Callable, Collection, Generator, Iterable, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import lru_cache
 from itertools import count
 from math import isfinite
-from operator import mul
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeAlias, cast
+from typing import Any, ClassVar, Literal, TypeAlias, TypeVar, cast
 
-from msgspec import Struct
+import numpy as np
+from msgspec import Struct, to_builtins
 from msgspec.structs import replace
 
 from shapespace.batch.result_folder import names_for
+from shapespace.cohort.orientation import view_rotation
 from shapespace.cohort.table import (
     fold_name,
     is_number,
@@ -34,16 +36,19 @@ from shapespace.cohort.table import (
 from shapespace.errors import FileError, FileFormatError, InputError
 from shapespace.io.containers.json_files import read_json
 from shapespace.io.files import atomic_path, make_folder, write_error, write_text
+from shapespace.io.landmarks.landmark_configurations import resample_polyline
 from shapespace.io.landmarks.landmark_io import read_surface_landmarks, surface_landmarks_text
 from shapespace.io.meshes.mesh_io import MESH_FILE_ENDINGS, mesh_files, stem_of
 from shapespace.io.tables.table_io import DECIMAL_COMMA, KEYS, MISSING, key_column, table_text
 from shapespace.io.volume_io import VOLUME_ENDINGS
-from shapespace.schemas import json_text, read
+from shapespace.schemas import NamedView, Orientation, read
+from shapespace.statistics.sides import pairs_by_name
 from shapespace.store.corresponding import LANDMARKS
 from shapespace.types import MM_PER_UNIT, SurfaceLandmarks
 
 Role = Literal["training", "new"]
 Point: TypeAlias = tuple[float, float, float]
+_Made = TypeVar("_Made")
 
 _AGAIN = "restore it from a copy, or start a new project"
 _MOST_CLASSES = 12  # classes of a column that the page counts
@@ -55,7 +60,8 @@ MOST_POINTS = 500
 """Largest number of names of landmarks, which the page lists for each scan."""
 _LONGEST_NAME = 60  # characters of the name of a landmark
 _MOST_UNDONE = 100  # edits that can be undone
-_MOST_TABLES = 32  # texts of tables that are kept: jobs read those of few sets of specimens
+_MOST_MADE = 32  # tables and landmarks that are cached: jobs read those of few sets of specimens
+_BEGINNING, _MOST_HASHES = 2**14, 2**15  # bytes of a file that are hashed, and hashes in memory
 _LONGEST_ID, _LONGEST_CELL = 100, 1000  # characters
 _NO_FILE_NAME = re.compile(r'[/\\:*?"<>|\x00-\x1f]')
 STALE = "Another tab changed the project; look at it and do it again."
@@ -86,6 +92,33 @@ class Specimen(Struct, frozen=True, kw_only=True):
     cells: dict[str, str] = {}
     points: dict[str, Point] = {}
 
+    def read_points(self) -> dict[str, Point]:
+        """Return the landmarks on the scan that commands read: in mm if it has a unit, and reflected if mirrored."""
+        mm = MM_PER_UNIT[self.unit] if self.unit else 1.0
+        x_mm = -mm if self.mirrored else mm
+        return {name: (x_mm * x, mm * y, mm * z) for name, (x, y, z) in self.points.items()}
+
+
+class ScanCurve(Struct, frozen=True):
+    """A curve on the scans, whose points are landmarks called NAME_1, NAME_2 and so on, which slide.
+
+    Args:
+        points: number of points.
+        closed: whether the first point follows the last.
+    """
+
+    points: int
+    closed: bool = False
+
+    def names(self, name: str) -> tuple[str, ...]:
+        """Return the names of the points of the curve called `name`."""
+        return tuple(f"{name}_{k}" for k in range(1, self.points + 1))
+
+    def spaced(self, points: Sequence[Point]) -> list[Point]:
+        """Return the points of the curve at equal distances along others in their order, two or more."""
+        spaced = resample_polyline(np.array(points), self.points, self.closed)
+        return [point_of(point) for point in spaced.tolist()]
+
 
 class State(Struct, frozen=True, kw_only=True):
     """Content of `project.json`.
@@ -95,8 +128,12 @@ class State(Struct, frozen=True, kw_only=True):
         columns: columns of the table, except the id.
         specimens: specimens in the order in which they were added.
         point_names: names of the landmarks on scans, in their order in files.
+        curves: name -> curve whose points are among these landmarks.
+        pairs: pairs of names of landmarks that mirror each other; None for those that their names show.
         landmarks: name -> vertex of the surfaces in correspondence.
         landmarks_on: folder of these surfaces in the project.
+        views: folder of surfaces -> named views in the frame of their mean shape; those of the key "" are in the frames
+            of the scans' files, which may differ.
     """
 
     FORMAT: ClassVar[str] = "shapespace-project"
@@ -107,13 +144,29 @@ class State(Struct, frozen=True, kw_only=True):
     columns: tuple[str, ...] = ()
     specimens: tuple[Specimen, ...] = ()
     point_names: tuple[str, ...] = ()
+    curves: dict[str, ScanCurve] = {}
+    pairs: tuple[tuple[str, str], ...] | None = None
     landmarks: dict[str, int] = {}
     landmarks_on: str = ""
+    views: dict[str, tuple[NamedView, ...]] = {}
 
     @property
     def names(self) -> list[tuple[str, ...]]:
         """The names by which a table can refer to each specimen: its id, and names of its file."""
         return [(specimen.id, *names_of_file(Path(specimen.file).name)) for specimen in self.specimens]
+
+    @property
+    def curve_points(self) -> frozenset[str]:
+        """The names of the landmarks that are points of curves."""
+        return frozenset(point for name, curve in self.curves.items() for point in curve.names(name))
+
+    @property
+    def mirrored_pairs(self) -> tuple[tuple[str, str], ...]:
+        """The pairs of landmarks that mirror each other: those that the user chose, or that the names show."""
+        found = pairs_by_name(self.point_names) if self.pairs is None else self.pairs
+        counts = {point: curve.points for name, curve in self.curves.items() for point in curve.names(name)}
+        named = (pair for pair in found if {*pair} <= {*self.point_names})
+        return tuple(pair for pair in named if counts.get(pair[0]) == counts.get(pair[1]))
 
     def chosen(self, role: Role) -> tuple[Specimen, ...]:
         """Return the included specimens of a role by name: the order in which they were added differs between drops."""
@@ -153,7 +206,7 @@ class Project:
         self.revision = 0
         self._undo: list[tuple[str, State]] = []
         self._redo: list[tuple[str, State]] = []
-        self._tables: list[tuple[tuple[object, ...], str]] = []
+        self._made: list[tuple[tuple[object, ...], Any]] = []
         self._lock = threading.RLock()
 
     @staticmethod
@@ -270,7 +323,9 @@ class Project:
         self.revision += is_edit
 
     def _write(self) -> None:
-        write_text(self.folder / self.FILE, json_text(self.state))
+        # Each specimen on a line of its own; with indentation it would take four times as long.
+        text = json.dumps(to_builtins(self.state), allow_nan=False).replace('{"id": ', '\n{"id": ')
+        write_text(self.folder / self.FILE, text + "\n")
 
     # Scans
 
@@ -311,32 +366,40 @@ class Project:
         Raises:
             FileError: the scan cannot be read.
         """
+        [added] = self._add_all([(file, called or file.name)], role)
+        return added
+
+    def _add_all(self, files: Sequence[tuple[Path, str]], role: Role) -> list[tuple[str, str | None]]:
+        """Add scans, each with the name of its file for the user, by one edit; see `add`."""
         with self._lock:
-            try:
-                size = file.stat().st_size
-                scans = [
-                    (specimen, place)
-                    for specimen in self.state.specimens
-                    for place in (specimen.file, specimen.original)
-                    if place
-                ]
-                for existing, place in scans:
-                    other = self.folder / place
-                    if other.is_file() and other.stat().st_size == size and filecmp.cmp(file, other, shallow=False):
-                        return existing.id, existing.id
-            except OSError as error:
-                raise FileError(f"Cannot read {file}: {error.strerror or error}.") from error
-            taken = {existing.id.casefold() for existing in self.state.specimens}
-            name = _free_name(_stem(called or file.name), taken)
-            inside = file.is_relative_to(self.folder)
-            place = file.relative_to(self.folder).as_posix() if inside else str(file)
-            specimen = Specimen(id=name, file=place, role=role)
-            self.edit(
-                None,
-                lambda state: ("", replace(state, specimens=(*state.specimens, specimen))),
-                together="add specimens",
-            )
-            return name, None
+            specimens, added = list[Specimen](), list[tuple[str, str | None]]()
+            taken = {specimen.id.casefold() for specimen in self.state.specimens}
+            known: dict[object, list[tuple[str, Path]]] = {}  # beginning of a file -> specimens with such a file
+            for specimen in self.state.specimens:
+                for other in (self.folder / place for place in (specimen.file, specimen.original) if place):
+                    with suppress(OSError):  # a scan that was moved is no duplicate
+                        known.setdefault(_beginning_of(other), []).append((specimen.id, other))
+            for file, called in files:
+                try:
+                    alike = known.setdefault(_beginning_of(file), [])
+                    same = next((name for name, other in alike if filecmp.cmp(file, other, shallow=False)), None)
+                except OSError as error:
+                    raise FileError(f"Cannot read {file}: {error.strerror or error}.") from error
+                name = same or _free_name(_stem(called), taken)
+                added.append((name, same))
+                if same is None:
+                    is_inside = file.is_relative_to(self.folder)
+                    place = file.relative_to(self.folder).as_posix() if is_inside else str(file)
+                    specimens.append(Specimen(id=name, file=place, role=role))
+                    taken.add(name.casefold())
+                    alike.append((name, file))
+            if specimens:
+                self.edit(
+                    None,
+                    lambda state: ("", replace(state, specimens=(*state.specimens, *specimens))),
+                    together="add specimens",
+                )
+            return added
 
     def add_stored(self, file: Path, role: Role, called: str) -> tuple[str, str | None]:
         """Add a scan in the project's folder, as `add` does; its file is removed if the scan is not added."""
@@ -345,6 +408,15 @@ class Project:
         if same is not None:
             file.unlink(missing_ok=True)
         return name, same
+
+    def keep_volume(self, file: Path) -> Path:
+        """Return the file of an uploaded volume: an earlier one with the same content, in whose place it is removed."""
+        with self._lock:
+            earlier = sorted(path for path in file.parent.glob("*") if path.name.lower().endswith(VOLUME_ENDINGS))
+            same = next((path for path in earlier if path != file and filecmp.cmp(path, file, shallow=False)), None)
+            if same is not None:
+                file.unlink()
+            return same or file
 
     def import_files(self, place: Path, role: Role, *, copy: bool) -> tuple[int, list[str]]:
         """Add a scan or the scans of a folder on this machine; return the number of those added, and
@@ -357,25 +429,27 @@ class Project:
         import shutil
 
         listed = mesh_files([place.resolve()])
-        notes, added = list(listed.left_out), 0
-        for file in listed.files:
-            target = file
-            if copy:
+        notes, added = list(listed.left_out), list[tuple[str, str | None]]()
+        if not copy:
+            added = self._add_all([(file, file.name) for file in listed.files], role)
+        else:
+            for file in listed.files:
                 target = self.new_file(file.name)
                 with self.removed_on_error(target), atomic_path(target) as path:
                     shutil.copyfile(file, path)
-            _, same = self.add_stored(target, role, file.name) if copy else self.add(target, role)
+                added.append(self.add_stored(target, role, file.name))
+        for file, (_, same) in zip(listed.files, added, strict=True):
             if same is not None:
                 notes.append(f"{file.name} is the same file as {same}; it was not added again.")
-            added += same is None
-        return added, notes
+        return sum(same is None for _, same in added), notes
 
     # Results that become scans
 
     def add_surfaces(self, folder: Path, role: Role) -> list[str]:
         """Add the surfaces of label volumes in a folder of the project; return sentences on those not added."""
-        added = [(file.stem, self.add(file, role)[1]) for file in sorted(folder.glob("*.ply"))]
-        return [f"{name} is the same surface as {same}; it was not added." for name, same in added if same is not None]
+        files = sorted(folder.glob("*.ply"))
+        added = zip(files, self._add_all([(file, file.name) for file in files], role), strict=True)
+        return [f"{file.stem} is the same surface as {same}; it was not added." for file, (_, same) in added if same]
 
     def take_groomed(self, groomed: Mapping[str, str]) -> None:
         """Use groomed scans; a specimen whose scan was changed since the start of the grooming keeps its scan.
@@ -442,12 +516,20 @@ class Project:
     def table(self, specimens: Iterable[Specimen]) -> str:
         """Return the table of specimens, as `compare` reads it."""
         columns, chosen = self.state.columns, tuple(specimens)
-        text = next((text for known, text in self._tables if known == (columns, chosen)), None)
-        if text is None:  # all jobs ask for it after each edit
+
+        def make() -> str:
             rows = [(specimen.id, *(specimen.cells.get(column, "") for column in columns)) for specimen in chosen]
-            text = table_text(("specimen", *columns), rows)
-            self._tables = [((columns, chosen), text), *self._tables[: _MOST_TABLES - 1]]
-        return text
+            return table_text(("specimen", *columns), rows)
+
+        return self.cached((columns, chosen), make)
+
+    def cached(self, key: tuple[object, ...], make: Callable[[], _Made]) -> _Made:
+        """Return the result of `make` for a key, computed once: all jobs ask for it after each edit."""
+        made = next((made for known, made in self._made if known == key), None)
+        if made is None:
+            made = make()
+            self._made = [(key, made), *self._made[: _MOST_MADE - 1]]
+        return made
 
     def landmark_table(self, surfaces: str) -> str:
         """Return the landmarks of the surfaces in a folder as a table: those that the user placed on them, and those
@@ -459,32 +541,35 @@ class Project:
         return surface_landmarks_text(others.joined(placed))
 
     def point_table(self, specimens: Iterable[Specimen]) -> str:
-        """Return the landmarks on scans, in the frames and units of their files, as a table with a row for each one, as
-        `landmarks convert` reads it; specimens are sorted by name.
-        """
-        rows = [
-            (specimen.id, name, *specimen.points.get(name, ("NA",) * 3))
-            for specimen in sorted(specimens, key=lambda specimen: name_key(specimen.id))
-            for name in self.state.point_names
-        ]
-        return table_text(("specimen", "landmark", *"xyz"), rows)
+        """Return the landmarks on scans, in the frames and units of their files, as `landmarks convert` reads them."""
+        return points_text({specimen.id: specimen.points for specimen in specimens}, self.state.point_names)
 
     def _landmark_texts(self, specimens: Iterable[Specimen], names: Collection[str] | None) -> dict[str, str]:
         """Return id -> table of the landmarks of each specimen that has some, as they are on the scan that commands
-        read: in mm if it has a unit, and reflected if it is mirrored. See `scan_list` for `names`.
+        read, without points of curves, which are not at the same place. See `scan_list` for `names`.
         """
         texts: dict[str, str] = {}
+        on_curves = self.state.curve_points
         for specimen in specimens:
-            mm = MM_PER_UNIT[specimen.unit] if specimen.unit else 1.0
-            factors = (-mm if specimen.mirrored else mm, mm, mm)
+            points = specimen.read_points()
             rows = [
-                (name, *map(mul, factors, specimen.points[name]))
+                (name, *points[name])
                 for name in self.state.point_names
-                if name in specimen.points and (names is None or name in names)
+                if name in points and name not in on_curves and (names is None or name in names)
             ]
             if len(rows) >= (1 if names is None else LEAST_LANDMARKS):
                 texts[specimen.id] = table_text(("name", *"xyz"), rows)
         return texts
+
+
+def points_text(points: Mapping[str, Mapping[str, Point]], names: Sequence[str]) -> str:
+    """Return the landmarks of specimens as a table with a row for each one; specimens are sorted by name."""
+    rows = [
+        (specimen, name, *points[specimen].get(name, ("NA",) * 3))
+        for specimen in sorted(points, key=name_key)
+        for name in names
+    ]
+    return table_text(("specimen", "landmark", *"xyz"), rows)
 
 
 class MatchedBlock(Struct, frozen=True, kw_only=True):
@@ -624,7 +709,7 @@ def change_of(request: Mapping[str, Any]) -> Callable[[State], tuple[str, State]
         "cells": _edit_cells, "block": _edit_block, "include": _include, "set": _set_role, "remove": _remove,
         "rename": _rename, "unit": _set_unit, "mirror": _mirror, "original": _use_original, "add-column": _add_column,
         "remove-column": _remove_column, "landmarks": _set_landmarks, "points": _edit_points,
-        "point-names": _set_point_names,
+        "point-names": _set_point_names, "views": _set_views, "curve": _set_curve, "pair": _set_pair,
     }  # fmt: skip
 
     def change(state: State) -> tuple[str, State]:
@@ -762,6 +847,26 @@ def _set_landmarks(state: State, request: Mapping[str, Any]) -> tuple[str, State
     return "change the landmarks", replace(state, landmarks=landmarks, landmarks_on=str(request.get("on", "")))
 
 
+def _set_views(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
+    """Set the named views of the surfaces in a folder, or of scans."""
+    on = str(request["on"])
+    views, before = (
+        read(Orientation, {"views": request[key]}, "The named views", "reload the page").views
+        for key in ("views", "before")
+    )
+    if state.views.get(on, ()) != before:
+        raise StaleError("Another tab changed the named views in the meantime; look at them, and do it again.")
+    names = [view.name for view in views]
+    for view in views:
+        view_rotation(view)
+        if not view.name.strip() or len(view.name) > _LONGEST_NAME or names.count(view.name) > 1:
+            raise InputError(
+                f"A view cannot be called {view.name[:_LONGEST_NAME]!r}; give it a name of at most {_LONGEST_NAME} "
+                "characters that no other has."
+            )
+    return "change the named views", replace(state, views={**state.views, on: views})
+
+
 def _edit_points(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
     """Place the landmarks of a specimen, or remove those without coordinates."""
     name, wanted = str(request["id"]), dict(request["points"])
@@ -801,14 +906,54 @@ def _set_point_names(state: State, request: Mapping[str, Any]) -> tuple[str, Sta
         replace(specimen, points={name: point for name, point in specimen.points.items() if name in names})
         for specimen in state.specimens
     )
-    _, edited = with_points(names, {})(replace(state, point_names=(), specimens=specimens))
+    curves = {name: curve for name, curve in state.curves.items() if {*curve.names(name)} <= {*names}}
+    _, edited = with_points(names, {})(replace(state, point_names=(), specimens=specimens, curves=curves))
     return "change the names of landmarks", edited
 
 
+def _set_curve(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
+    """Add a curve, or set the number of its points, which are then spaced evenly on all scans."""
+    name, curve = str(request["name"]).strip(), ScanCurve(int(request["points"]), bool(request["closed"]))
+    if not name or not LEAST_LANDMARKS <= curve.points <= MOST_POINTS:
+        raise InputError(f"A curve needs a name, and {LEAST_LANDMARKS} to {MOST_POINTS} points.")
+    if name in state.point_names:
+        raise InputError(f"There is a landmark called {name}; give the curve another name.")
+    old, new = state.curves.get(name, curve).names(name), curve.names(name)
+    partly = [specimen.id for specimen in state.specimens if 0 < len({*old} & {*specimen.points}) < len(old)]
+    if partly:
+        raise InputError(
+            f"Only some points of the curve {name} are placed on {partly[0]}; place all, or remove them, and try again."
+        )
+
+    def with_spaced(specimen: Specimen) -> Specimen:
+        placed = [specimen.points[point] for point in old if point in specimen.points]
+        spaced = curve.spaced(placed) if placed else []
+        others = {point: place for point, place in specimen.points.items() if point not in old}
+        return replace(specimen, points=others | dict(zip(new, spaced, strict=False)))
+
+    edited = replace(
+        state,
+        point_names=tuple(point for point in state.point_names if point not in old),
+        specimens=tuple(map(with_spaced, state.specimens)),
+        curves={**state.curves, name: curve},
+        pairs=state.pairs and tuple(pair for pair in state.pairs if new == old or not {*pair} & {*old}),
+    )
+    return f"set the points of the curve {name}", with_points(new, {})(edited)[1]
+
+
+def _set_pair(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
+    """Let two landmarks, or two curves, mirror each other, or one of them none."""
+    name, other = str(request["name"]), str(request["other"])
+    points, others = (state.curves[end].names(end) if end in state.curves else (end,) for end in (name, other))
+    kept = [pair for pair in state.mirrored_pairs if not {*pair} & {*points, *others}]
+    pairs = (*kept, *zip(points, others, strict=False)) if other else tuple(kept)
+    return f"set the mirrored pair of {name}", replace(state, pairs=pairs)
+
+
 def with_points(
-    names: Sequence[str], points: Mapping[str, Mapping[str, Point]]
+    names: Sequence[str], points: Mapping[str, Mapping[str, Point]], curves: Mapping[str, ScanCurve] = {}
 ) -> Callable[[State], tuple[str, State]]:
-    """Return the edit that adds landmarks, with their points by specimen, to those that the project has.
+    """Return the edit that adds landmarks, with their points by specimen, to those that the project has, and curves.
 
     Raises:
         InputError: by the edit, if a name cannot be in a table of landmarks, or there are too many names.
@@ -826,7 +971,8 @@ def with_points(
         edited = _edit_specimens(
             state, points, lambda specimen: replace(specimen, points={**specimen.points, **points[specimen.id]})
         )
-        return f"take landmarks of {_count_text(points)}", replace(edited, point_names=together)
+        edited = replace(edited, point_names=together, curves={**state.curves, **curves})
+        return f"take landmarks of {_count_text(points)}", edited
 
     return change
 
@@ -895,13 +1041,26 @@ def scan_key(scan: Path, folder: Path) -> str:
     Scans in the project's `folder`, which may be moved, are identified by their path in it, others by their complete
     path: those of an archive can have the same name, size and time in different folders.
     """
-    place = scan.relative_to(folder).as_posix() if scan.is_relative_to(folder) else str(scan)
+    # Methods of pathlib would take most of the time of a state.
+    place = scan.as_posix().removeprefix(f"{folder.as_posix()}/")
     try:
         stat = scan.stat()
         text = f"{place}|{stat.st_size}|{stat.st_mtime_ns}"
     except OSError:
         text = f"{place}|missing"
     return hashlib.sha256(text.encode(errors="surrogateescape")).hexdigest()[:24]
+
+
+def _beginning_of(file: Path) -> tuple[int, bytes]:
+    """Return the size of a file and a hash of its beginning, which distinguish nearly all files."""
+    stat = file.stat()
+    return stat.st_size, _hash_of_beginning(str(file), stat.st_size, stat.st_mtime_ns)
+
+
+@lru_cache(maxsize=_MOST_HASHES)
+def _hash_of_beginning(path: str, size: int, modified_ns: int) -> bytes:
+    with Path(path).open("rb") as file:
+        return hashlib.sha256(file.read(_BEGINNING)).digest()
 
 
 def _ending(name: str) -> str:

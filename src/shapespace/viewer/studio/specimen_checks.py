@@ -17,19 +17,19 @@ from typing import Any
 import numpy as np
 
 from shapespace.batch.workers import context, end_after
-from shapespace.correspondence.odd_scans import ScanMeasures
+from shapespace.correspondence.odd_scans import ScanMeasures, side_sample
 from shapespace.errors import FileError, InputError, ShapespaceError
 from shapespace.geometry.doctor import examine_and_repair
-from shapespace.geometry.mirror_plane import mirror_image
+from shapespace.geometry.mirror_plane import FLIP, mirror_image
 from shapespace.geometry.normals import boundary_edges, drawable
 from shapespace.io.files import sha256_of_file, write_bytes, write_text
 from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.report.render.scene import decimate, pack
 from shapespace.report.render.thumbnails import mesh_still
-from shapespace.types import Mesh
+from shapespace.types import FloatArray, Mesh, read_only
 from shapespace.viewer.studio.project import scan_key
 
-_FOLDER = "checks"
+_FOLDER, _SAMPLE = "checks", ".points"
 _MOST_PROCESSES = 4
 _MOST_DRAWN, _MOST_TURNING = 100_000, 12_000  # triangles of a scan in its view, at rest and while it turns
 _KEY = 24  # hexadecimal digits of the hash of a scan
@@ -68,7 +68,9 @@ class SpecimenChecks:
         except (OSError, ValueError):
             self._ask(key, scan)
             return None
-        if facts.get("state") == "ready" and not {"profile", "content"} <= facts.keys():  # from an earlier version
+        if (
+            facts.get("state") == "ready" and not {"profile", "content", "box"} <= facts.keys()
+        ):  # from an earlier version
             self._ask(key, scan)
             return None
         self._known[key] = facts
@@ -77,6 +79,14 @@ class SpecimenChecks:
     def picture(self, scan: Path) -> Path:
         """Return the path of the picture of a scan, which exists once it was checked and is usable."""
         return self._folder / f"{scan_key(scan, self._folder.parent)}.webp"
+
+    def sample(self, scan: Path, *, mirrored: bool) -> FloatArray | None:
+        """Return the sample of a scan or of its mirror image, (P, 6), see `side_sample`; None if there is none."""
+        file = self.picture(scan).with_suffix(_SAMPLE)
+        if not file.is_file():
+            return None
+        sample = read_only(np.fromfile(file, dtype=np.float32).reshape(-1, 6))
+        return sample * np.tile(FLIP, 2) if mirrored else sample
 
     def surface(self, scan: Path, *, mirrored: bool) -> Future[bytes]:
         """Return the packed surface of a scan for a view, as it is in its file or reflected at x = 0.
@@ -191,7 +201,10 @@ def check_scan(scan: Path, stem: Path) -> dict[str, Any]:
         }  # fmt: skip
         if repaired is not None:
             measures = ScanMeasures.of(repaired)
-            facts |= {"size": measures.size, "profile": measures.profile.tolist()}
+            box = [repaired.vertices.min(axis=0).tolist(), repaired.vertices.max(axis=0).tolist()]
+            facts |= {"size": measures.size, "profile": measures.profile.tolist(), "box": box}
+            if repaired.faces is not None:
+                write_bytes(stem.with_suffix(_SAMPLE), side_sample(repaired).astype(np.float32).tobytes())
             picture, _ = mesh_still(repaired)
             write_bytes(stem.with_suffix(".webp"), picture)
     except ShapespaceError as error:
