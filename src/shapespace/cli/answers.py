@@ -32,8 +32,8 @@ class InputAccepted(Exception):  # noqa: N818 - no error
 
 
 def reason_of_rejection(words: Sequence[str], folders: Sequence[Path]) -> str:
-    """Return why the command of a question would reject its input; empty if it begins to compute. `align`, which
-    questions about landmarks read, computes its result.
+    """Return why the command of a question would reject its input; empty if it begins to compute. `align`
+    computes its result, which questions about landmarks on scans read.
 
     Args:
         words: arguments of the command.

@@ -10,7 +10,6 @@ from shapespace.cli.options import Option
 from shapespace.formats.registry import MODEL_FORMATS
 from shapespace.io.landmarks.configuration_io import CONFIGURATION_FORMATS, FOLDER_FORMATS
 from shapespace.statistics.shape_tests.test_table import SHAPE_TESTS
-from shapespace.viewer.studio.placed_landmarks import MISSING_CHOICES, MISSING_LANDMARKS
 
 _KINDS: Mapping[str, str] = {
     "identify": "recognise identify",
@@ -78,14 +77,6 @@ _ACTIONS: Mapping[str, str] = {
 _QUESTIONS = frozenset(
     {"compare", "change", "asymmetry", "regress", "score", "identify", *(t.name for t in SHAPE_TESTS)}
 )
-_OF_PLACED: Mapping[str, Any] = {
-    "flag": MISSING_LANDMARKS, "argument": "", "label": "Missing landmarks", "kind": "choice",
-    "help": "specimens that lack landmarks, or landmarks that specimens lack, are excluded, or missing landmarks are "
-    "estimated; the estimate is from the complete specimens, by a thin-plate spline of their mean or by regression",
-    "choices": list(MISSING_CHOICES), "initial": MISSING_CHOICES[0], "visible": True, "required": False,
-}  # fmt: skip
-"""Option of questions about the landmarks on scans, for the command that aligns them; changes in mm and identities need
-surfaces or fits."""
 _LABELS: Mapping[str, str] = {
     "anova-type": "Sums of squares", "columns": "Columns of measurements", "covariate": "Covariate", "effect": "Effect",
     "margin": "Margin (distance)", "margin-sd": "Margin (standard deviations)", "modules": "File of modules",
@@ -207,6 +198,8 @@ def forms(commands: Mapping[str, tuple[str, Sequence[Option]]]) -> dict[str, dic
     Args:
         commands: name -> summary and options, of all commands.
     """
+    from shapespace.viewer.studio.placed_landmarks import MISSING_CHOICES, MISSING_LANDMARKS  # slow to import
+
     made: dict[str, dict[str, Any]] = {}
     for kind, first in _FIRST.items():
         command = _KINDS.get(kind, kind)
@@ -222,8 +215,15 @@ def forms(commands: Mapping[str, tuple[str, Sequence[Option]]]) -> dict[str, dic
         "help": "csv has a row for each specimen, long a row for each landmark; the last two are of 3D Slicer",
     }  # fmt: skip
     made["score"]["options"][0]["kind"] = "class"
+    # Changes in mm and identities need surfaces or fits.
     for kind in _QUESTIONS.union(("morphospace",)) - {"identify", "change"}:
-        made[kind]["options"].append(_OF_PLACED)
+        made[kind]["options"].append({
+            "flag": MISSING_LANDMARKS, "argument": "", "label": "Missing landmarks", "kind": "choice",
+            "help": "specimens that lack landmarks, or landmarks that specimens lack, are excluded, or missing "
+            "landmarks are estimated; the estimate is from the complete specimens, by a thin-plate spline of their "
+            "mean or by regression",
+            "choices": list(MISSING_CHOICES), "initial": MISSING_CHOICES[0], "visible": True, "required": False,
+        })  # fmt: skip
     return made
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 
+from shapespace.cli.forms import forms
 from shapespace.cli.options import given
 from shapespace.cli.printing import now
 from shapespace.viewer.serve import serve, serve_studio
@@ -11,8 +12,6 @@ from shapespace.viewer.serve import serve, serve_studio
 
 def view(arguments: argparse.Namespace) -> int:
     """Show a result or a project in the browser."""
-    from shapespace.cli.forms import forms  # slow to import
-
     options = given(arguments, serve)
     serve(
         arguments.path,
@@ -26,8 +25,6 @@ def view(arguments: argparse.Namespace) -> int:
 
 def studio(arguments: argparse.Namespace) -> int:
     """Run the studio in the browser."""
-    from shapespace.cli.forms import forms  # slow to import
-
     options = given(arguments, serve_studio)
     serve_studio(arguments.project, forms(arguments.commands()), **options, open_browser=not arguments.no_open, say=now)
     return 0

@@ -7,7 +7,6 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
-_DECIMAL_COMMA = re.compile(r"([+-]?[0-9]*),([0-9]+(?:[eE][+-]?[0-9]+)?)")
 _THOUSANDS = re.compile(r"[+-]?[1-9][0-9]{0,2},[0-9]{3}")
 _LARGEST = 2**63
 """Bound of integers: JSON, in which all settings are written, has no larger ones."""
@@ -50,7 +49,11 @@ def number(text: str) -> float:
 
 def _decimal(text: str) -> float:
     """Return a number with a decimal point or comma; 1,000 is rejected, as it may be a thousand."""
-    return float(text if _THOUSANDS.fullmatch(text) else _DECIMAL_COMMA.sub(r"\1.\2", text))
+    if "," in text and not _THOUSANDS.fullmatch(text):
+        from shapespace.io.tables.table_io import DECIMAL_COMMA  # slow to import, and few numbers have a comma
+
+        text = text.replace(",", ".") if DECIMAL_COMMA.fullmatch(text) else text
+    return float(text)
 
 
 def probability(text: str) -> float:

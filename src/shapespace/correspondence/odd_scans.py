@@ -191,12 +191,12 @@ class _Side:
         """Return the mean distance between two surfaces in their best pose: rigid ICP from some of the 24 poses that
         align their principal axes."""
         R = self.axes @ _TURNS @ other.axes.T
-        far = self.nearest(other.points[:_COARSE] @ R.transpose(0, 2, 1))[0].mean(axis=1)
-        R, t = R[far.argsort()[:_STARTS]], np.zeros((_STARTS, 3))
+        distances = self.nearest(other.points[:_COARSE] @ R.transpose(0, 2, 1))[0].mean(axis=1)
+        R, t = R[distances.argsort()[:_STARTS]], np.zeros((_STARTS, 3))
         own, theirs = self.points[:_MATCHED], other.points[:_MATCHED]
         for _ in range(_ITERATIONS):
-            there, back = theirs @ R.transpose(0, 2, 1) + t[:, None], (own - t[:, None]) @ R
-            (forward, y, _), (backward, x, _) = self.nearest(there), other.nearest(back)
+            theirs_mapped, own_mapped = theirs @ R.transpose(0, 2, 1) + t[:, None], (own - t[:, None]) @ R
+            (forward, y, _), (backward, x, _) = self.nearest(theirs_mapped), other.nearest(own_mapped)
             a, b = (np.concatenate(np.broadcast_arrays(*points), axis=1) for points in ((y, own), (theirs, x)))
             distances = np.concatenate([forward, backward], axis=1)
             w = (1.0 + (distances / (2.0 * np.median(distances, axis=1, keepdims=True))) ** 2)[..., None] ** -2
@@ -204,8 +204,8 @@ class _Side:
             u, _, vt = np.linalg.svd((w * (a - mean_a)).transpose(0, 2, 1) @ (b - mean_b))
             u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
             R, t = u @ vt, (mean_a - mean_b @ (u @ vt).transpose(0, 2, 1))[:, 0]
-        there, back = theirs @ R.transpose(0, 2, 1) + t[:, None], (own - t[:, None]) @ R
-        matches = ((there, self.nearest(there)), (back, other.nearest(back)))
+        theirs_mapped, own_mapped = theirs @ R.transpose(0, 2, 1) + t[:, None], (own - t[:, None]) @ R
+        matches = ((theirs_mapped, self.nearest(theirs_mapped)), (own_mapped, other.nearest(own_mapped)))
         to_planes = [np.abs(((places - p) * n).sum(axis=-1)).mean(axis=1) for places, (_, p, n) in matches]
         return float(np.sum(to_planes, axis=0).min())
 

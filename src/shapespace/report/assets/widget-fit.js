@@ -16,7 +16,7 @@
 
   /**
    * A scan and the model that was fitted to it: stages, layout, colours, opacities, threshold.
-   * wanted: {layout, colour} to begin with; onchange(state): it is drawn anew.
+   * wanted: initial {layout, colour}; onchange(state): called after each drawing.
    */
   parts.fit = function ({ facts, arrays }, { stage, controls, wanted, onchange = () => {} }) {
     const { stages } = facts, limit = facts.scale_mm > 0 ? facts.scale_mm : 1;
@@ -32,7 +32,7 @@
       marked: false,
       threshold: Math.min(limit / 2, 2),
     };
-    const said = make("p", { class: "ss-said", "aria-live": "polite", "data-testid": "fit-share" });
+    const announcement = make("p", { class: "ss-said", "aria-live": "polite", "data-testid": "fit-share" });
     const nameOf = (name, long) => (name !== "final" || stages.includes("initial") ? STAGES[name][long] : long ? "The fitted model" : "Fitted");
     const isSide = () => state.layout === "side";
     const distances = () => (state.colour === "model" ? arrays[`model_to_scan_${state.stage}`] : state.colour === "scan" ? arrays[`scan_to_model_${state.stage}`] : null);
@@ -77,8 +77,8 @@
       else stage.legend(null);
       mark.hidden = !values;
       beyond.row.hidden = !values || !state.marked;
-      said.textContent = values ? sentence() : state.colour === "regions" && facts.region_shares ? shares() : "";
-      said.hidden = !said.textContent;
+      announcement.textContent = values ? sentence() : state.colour === "regions" && facts.region_shares ? shares() : "";
+      announcement.hidden = !announcement.textContent;
     }
 
     // Figures are of all vertices, also where fewer are drawn.
@@ -148,7 +148,7 @@
     });
     state.threshold = beyond.get();
     controls.append(
-      ...(facts.without_scan ? [make("p", { text: facts.without_scan, "data-testid": "fit-without-scan" })] : []), ...[stageRow, layoutRow, colourRow].filter(Boolean).map(({ row }) => row), mark, beyond.row, said,
+      ...(facts.without_scan ? [make("p", { text: facts.without_scan, "data-testid": "fit-without-scan" })] : []), ...[stageRow, layoutRow, colourRow].filter(Boolean).map(({ row }) => row), mark, beyond.row, announcement,
       make("div", { class: "ss-sliders", role: "group", "aria-label": "Visibility and opacity" }, scan && scan.row, model.row)
     );
     if (facts.thinned) controls.append(make("p", { class: "ss-hint", text: "Drawn with fewer triangles than there are; the numbers are of all." }));

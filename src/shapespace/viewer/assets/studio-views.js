@@ -36,10 +36,10 @@
     if (!["correspond", "redo", "build"].includes(job.kind)) return undefined;
     if (job.kind !== "build") return job.output;
     const words = job.command.split(/[\s/]+/); // the mean shape of a model has the frame of its surfaces
-    return Studio.jobsOf(["correspond"]).map((one) => one.output).find((output) => words.includes(output));
+    return Studio.jobsOf(["correspond"]).map((other) => other.output).find((output) => words.includes(output));
   };
 
-  /** Names and removes views: the current one, and those of before. */
+  /** A form that names the current view, and renames and removes existing ones. */
   function Form({ views, shown, save, onclose, hint }) {
     const [name, setName] = useState("");
     const [roll, setRoll] = useState(degrees(shown.view.camera.roll));
@@ -47,18 +47,18 @@
     const add = async (event) => {
       event.preventDefault();
       const view = { name: name.trim(), ...directionsOf(shown) };
-      const isKnown = views.some((one) => one.name === view.name);
-      if (await save(isKnown ? views.map((one) => (one.name === view.name ? view : one)) : [...views, view])) setName("");
+      const isKnown = views.some((known) => known.name === view.name);
+      if (await save(isKnown ? views.map((known) => (known.name === view.name ? view : known)) : [...views, view])) setName("");
     };
-    const rename = async (old, field) => { if (!(await save(views.map((one) => (one === old ? { ...one, name: field.value.trim() } : one))))) field.value = old.name; };
+    const rename = async (old, field) => { if (!(await save(views.map((known) => (known === old ? { ...known, name: field.value.trim() } : known))))) field.value = old.name; };
     return html`
       <form class="row" data-testid="views-form" onsubmit=${add} onkeydown=${(event) => { if (event.key === "Escape") { event.preventDefault(); event.stopPropagation(); onclose(); } }}>
         <label>${V.name} <input required size="10" list="view-names" data-testid="view-name" value=${name} oninput=${(event) => setName(event.target.value)} /></label>
-        <datalist id="view-names">${[...new Set([...views.map((one) => one.name), ...V.names])].map((one) => html`<option value=${one}></option>`)}</datalist>
+        <datalist id="view-names">${[...new Set([...views.map((known) => known.name), ...V.names])].map((known) => html`<option value=${known}></option>`)}</datalist>
         <label>${V.roll} <input type="range" min="-180" max="180" step="1" data-testid="view-roll" value=${roll} oninput=${rotate} /></label>
         <button class="small strong" data-testid="view-save" disabled=${!name.trim()}>${V.save}</button>
-        ${views.map((one) => html`<span class="tag" key=${one.name}><input size="8" aria-label=${V.rename(one.name)} data-testid=${`view-rename-${one.name}`} value=${one.name} onchange=${(event) => rename(one, event.target)} />
-          <${Button} small class="quiet" testid=${`view-remove-${one.name}`} aria-label=${V.remove(one.name)} onclick=${() => save(views.filter((other) => other !== one))}>×<//></span>`)}
+        ${views.map((known) => html`<span class="tag" key=${known.name}><input size="8" aria-label=${V.rename(known.name)} data-testid=${`view-rename-${known.name}`} value=${known.name} onchange=${(event) => rename(known, event.target)} />
+          <${Button} small class="quiet" testid=${`view-remove-${known.name}`} aria-label=${V.remove(known.name)} onclick=${() => save(views.filter((other) => other !== known))}>×<//></span>`)}
         <${Button} small testid="views-close" onclick=${onclose}>${T.close}<//><span class="hint">${hint}</span></form>`;
   }
 
@@ -71,7 +71,7 @@
     if (on === undefined || (Studio.state.read_only && !views.length)) return null;
     return html`
       <div class="row named-views" role="group" aria-label=${V.title} data-testid="views">
-        ${views.map((one) => html`<${Button} small key=${one.name} disabled=${!shown} testid=${`named-view-${one.name}`} onclick=${() => turnTo(shown, one)}>${one.name}<//>`)}
+        ${views.map((known) => html`<${Button} small key=${known.name} disabled=${!shown} testid=${`named-view-${known.name}`} onclick=${() => turnTo(shown, known)}>${known.name}<//>`)}
         ${!naming && html`<${Button} edits small class="quiet" disabled=${!shown} testid="views-edit" onclick=${() => setNaming(true)}>${views.length ? V.edit : V.first}<//>`}
         ${other && html`<${Button} edits small class="quiet" testid="views-take" onclick=${() => save(all[other])}>${V.take(other)}<//>`}
         ${naming && html`<${Form} views=${views} shown=${shown} save=${save} onclose=${() => setNaming(false)} hint=${on ? V.hint : V.scans} />`}

@@ -25,7 +25,7 @@
     return jobs.some((job) => job.status === "done") ? "done" : null;
   }
 
-  /** Number of changes of the address; the screen is drawn anew after each. */
+  /** Number of changes of the address; each draws the screen. */
   function useVisit() {
     const [visit, setVisit] = useState(0);
     useEffect(() => {

@@ -90,7 +90,7 @@
   Viewer.makeFitsTab = function (page) {
     const { $ } = page;
     let selected = -1;
-    let fit = null, steps = null; // what is drawn of the selected one
+    let fit = null, steps = null; // controls and iterations of the selected fit, if it is drawn
     let wanted = { layout: "overlay", colour: "plain" }; // as the user chose for the last one
 
     function stop() {

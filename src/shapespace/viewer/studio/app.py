@@ -10,6 +10,7 @@ import zipfile
 from collections.abc import AsyncGenerator, Callable, Generator, Mapping
 from contextlib import ExitStack, aclosing, suppress
 from functools import lru_cache, partial
+from itertools import compress
 from pathlib import Path
 from typing import Any, cast
 
@@ -83,7 +84,7 @@ _EVENT_S = 0.4  # between events
 _MIRRORED = (
     "Probably a mirror image of most others, such as a left one among right ones; mirror it under Specimens if so."
 )
-_BESIDE = 0.1  # of the extent of a scan, from which on a landmark is not on it
+_OUTSIDE = 0.1  # distance of a landmark from the box around its scan, as a share of the scan's extent, that is named
 _MOST_LISTED = 2000  # folders and files of a listing
 
 
@@ -114,8 +115,6 @@ class OpenProject:
         self._sentence = labels.sentence
         self._forms = forms
         self._outdated: tuple[object, dict[int, Outdated]] = (None, {})
-        self._odd: tuple[object, dict[str, OddScan]] = (None, {})
-        self._mirrored: tuple[object, list[str]] = (None, [])
         for resource in (self.views, self.checks, self.jobs):
             self._resources.callback(resource.close)
 
@@ -153,11 +152,13 @@ class OpenProject:
             for specimen in self.project.state.specimens
             if specimen.included and "profile" in facts.get(specimen.id, ())
         ]
-        if key != self._odd[0]:
+
+        def find() -> dict[str, OddScan]:
             measures = [ScanMeasures(size, np.array(profile)) for _, _, size, profile in key]
             found = find_odd_scans(measures, [unit for _, unit, _, _ in key])
-            self._odd = key, {key[k][0]: odd for k, odd in found.items()}
-        return self._odd[1]
+            return {key[k][0]: odd for k, odd in found.items()}
+
+        return self.project.cached(("odd scans", *key), find)
 
     def mirrored_scans(self) -> list[str]:
         """Return the ids of the specimens for training that are probably mirror images of most others.
@@ -173,14 +174,16 @@ class OpenProject:
         key = [
             (specimen.id, specimen.mirrored, scan_key(project.path(specimen), project.folder)) for specimen in chosen
         ]
-        if key != self._mirrored[0]:
+
+        def find() -> list[str]:
             samples = {
                 specimen.id: self.checks.sample(project.path(specimen), mirrored=specimen.mirrored)
                 for specimen in chosen
             }
             known = {name: sample for name, sample in samples.items() if sample is not None}
-            self._mirrored = key, [list(known)[k] for k in find_mirrored_scans(list(known.values()))]
-        return self._mirrored[1]
+            return [list(known)[k] for k in find_mirrored_scans(list(known.values()))]
+
+        return project.cached(("mirrored scans", *key), find)
 
     def landmarks_off_scans(self) -> dict[str, str]:
         """Return a sentence on each specimen with landmarks outside of the box around its scan, by its id."""
@@ -190,14 +193,11 @@ class OpenProject:
             if box is None or not specimen.points:
                 continue
             low, high = np.array(box)
-            beside = np.abs(np.array([*specimen.points.values()]) - (low + high) / 2) - (high - low) / 2
-            off = [
-                name
-                for name, far in zip(specimen.points, beside, strict=True)
-                if far.max() > _BESIDE * (high - low).max()
-            ]
-            if off:
-                names = first_names(off)
+            points = np.array([*specimen.points.values()])
+            distances = np.maximum(low - points, points - high).max(axis=1)  # to the box, negative inside
+            is_off = distances > _OUTSIDE * (high - low).max()
+            if is_off.any():
+                names = first_names([*compress(specimen.points, is_off)])
                 found[specimen.id] = (
                     f"{specimen.id}: not on its scan: {names}; check the unit and axes of the landmarks."
                 )
@@ -231,7 +231,7 @@ class OpenProject:
                 "unit": specimen.unit, "mirrored": specimen.mirrored, "groomed": bool(specimen.original),
                 "cells": specimen.cells, "points": specimen.points,
                 "scan": scan_key(project.path(specimen), project.folder),
-                **{key: fact for key, fact in facts.items() if key not in ("profile", "content")},
+                **{key: fact for key, fact in facts.items() if key not in ("profile", "content", "box")},
                 "findings": [{**finding, "text": self._sentence(finding["text"])} for finding in facts["findings"]],
             })  # fmt: skip
         return {
@@ -408,9 +408,7 @@ class Studio:
                 if sent != self._changes:
                     sent = self._changes
                     yield f"data: {json.dumps({'revision': sent})}\n\n"
-                await asyncio.sleep(
-                    max(_EVENT_S, 2.0 * self._state_s)
-                )  # so that most of the time is for other requests
+                await asyncio.sleep(max(_EVENT_S, 2.0 * self._state_s))  # the rest of the time is for other requests
 
         return StreamingResponse(stream(), media_type="text/event-stream")
 

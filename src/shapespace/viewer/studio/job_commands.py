@@ -516,8 +516,9 @@ def _reason_of_rejection(
         folders = [] if is_parsed_only else [folder, project.folder]
         aligned = [[str(folder / word) if word in made.files else word for word in words] for words in made.before]
         check, record = forms[kind]["check"], folder / _INPUTS / "0000-landmarks/aligned" / RECORD
-        rejections = [*(str(check(words, [folder])) for words in aligned)]
-        reason = "".join(rejections) or str(check([*made.arguments, *way], folders))
+        reason = "".join(str(check(words, [folder])) for words in aligned) or str(
+            check([*made.arguments, *way], folders)
+        )
         notes = read(AlignRecord, read_json(record, ""), str(record), "").notes if record.is_file() else ()
         texts = [
             text.replace(str(folder / next(iter(made.files))), "The table")

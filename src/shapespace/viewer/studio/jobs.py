@@ -376,11 +376,13 @@ def history(jobs: list[Job]) -> str:
         'run() { "$@"; code=$?; [ $code -le 1 ] || { echo "This command failed: $*" >&2; exit $code; }; }',
     ]
     done = [job for job in jobs if job.status == "done"]
-    made = {words[words.index("-o") + 1] for job in done for words in job.before}
+    # Outputs that a job reads by its arguments; others are in lists, which refer to files of the project.
+    outputs = {words[words.index("-o") + 1] for job in done for words in job.before}
+    outputs &= {word for job in done for word in job.arguments}
     for arguments in (words for job in done for words in (*job.before, job.arguments)):
         words = [
             f'"$PROJECT"/{shlex.quote(word)}'
-            if word.startswith(_OF_PROJECT) and word not in made
+            if word.startswith(_OF_PROJECT) and word not in outputs
             else shlex.quote(word)
             for word in arguments
         ]

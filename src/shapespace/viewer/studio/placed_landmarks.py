@@ -14,14 +14,14 @@ from shapespace.io.tables.table_io import table_text
 from shapespace.viewer.studio.project import Point, Project, ScanCurve, Specimen, State, points_text
 
 PLACED = 0
-"""Number that stands for the landmarks on scans where jobs are given whose shapes a question is about."""
+"""Job number of questions about the landmarks on scans, which no job made."""
 MISSING_LANDMARKS = "missing-landmarks"
 """Option of questions about the landmarks on scans, with one of `MISSING_CHOICES`; no command has it."""
 EXCLUDE_LANDMARKS = "exclude-landmarks"
 _ESTIMATES: Mapping[str, str] = {"estimate-by-spline": "tps", "estimate-by-regression": "regression"}
 MISSING_CHOICES = ("exclude-specimens", EXCLUDE_LANDMARKS, *_ESTIMATES)
-"""What is done about missing landmarks: specimens that lack some are excluded, landmarks that some specimens lack are
-excluded, or missing landmarks are estimated."""
+"""Treatments of missing landmarks: exclusion of incomplete specimens, exclusion of incomplete landmarks, or an estimate
+by one of two methods."""
 
 
 @dataclass(frozen=True)
