@@ -100,8 +100,13 @@
     latest.current = on;
     useEffect(() => {
       const element = box.current;
-      let ended = false, timer = 0;
-      const later = () => { clearTimeout(timer); timer = setTimeout(() => { if (!ended && shown.current) Studio.keepPlace({ result, view: view.kind, ...shown.current.place() }); }, 250); };
+      let ended = false, timer = 0, kept = location.hash;
+      const keep = () => {
+        if (ended || !shown.current || location.hash !== kept) return; // the user goes elsewhere, and the page is not told yet
+        Studio.keepPlace({ result, view: view.kind, ...shown.current.place() });
+        kept = location.hash;
+      };
+      const later = () => { clearTimeout(timer); timer = setTimeout(keep, 250); };
       Viewer.guarded(async () => {
         await Viewer.load(...SCRIPTS[view.kind]);
         if (ended) return;
