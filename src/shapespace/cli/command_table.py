@@ -457,6 +457,7 @@ COMMANDS: tuple[CommandSpec, ...] = (
                      "repeated", parse=values.named_file, repeat=True),
             advanced("--min-seen", "SHARE", source=BUILD_FILES, parse=values.share),
             advanced("--representation", source=BUILD, choices=_REPRESENTATIONS),
+            advanced("--relative-pose", source=BUILD),
             advanced("--control-points", "MxN", source=BUILD, parse=values.control_points),
             advanced("--additive", "LABELS.csv", source=BUILD_FILES, field="labels"),
             advanced("--expression-variance", "SHARE", source=BUILD_FILES, parse=values.share),

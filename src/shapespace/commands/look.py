@@ -288,6 +288,7 @@ def model_facts(model: ShapeModel) -> dict[str, Any]:
         "landmarks": list(model.landmarks),
         **({"landmark_distances_mm": dict(zip(model.landmarks, off, strict=True))} if any(off) else {}),
         **({"regions": {name: len(vertices) for name, vertices in model.regions.items()}} if model.regions else {}),
+        **({"parts": list(model.parts)} if model.parts else {}),
         "representation": model.representation,
         **({} if counts is None else {"control_points": counts.tolist()}),
         "provenance": model.provenance,

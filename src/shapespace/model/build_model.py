@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 from numbers import Real
 from os import PathLike
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
 from shapespace.errors import InputError
+from shapespace.geometry.articulation import Articulation
 from shapespace.geometry.bspline import SplineSquare
 from shapespace.geometry.flatten import disc_map
 from shapespace.geometry.mirror_plane import mirrored_note
@@ -22,7 +23,7 @@ from shapespace.io.interop import MeshLike, as_meshes
 from shapespace.model.choose_modes import below_precision, made_by_alignment, modes_notes, number_of_modes, rounding_mm
 from shapespace.model.missing import MIN_SEEN, CompletedShapes, ObservedMeshes, complete, missing_notes, pose_on_shared
 from shapespace.model.pca import Modes, PrincipalComponents, plain_modes, principal_components
-from shapespace.model.representation import Representation, Vertices, representation_named
+from shapespace.model.representation import Articulated, Representation, Vertices, representation_named
 from shapespace.model.shape_model import ShapeModel, odd_size_notes
 from shapespace.model.streamed import (
     AlignedShapes,
@@ -46,6 +47,8 @@ from shapespace.types import (
     require,
 )
 
+RelativePose: TypeAlias = Literal["modelled", "kept", "removed"]
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BuildConfig:
@@ -68,6 +71,11 @@ class BuildConfig:
             from a model of vertices.
         provenance: description of the meshes, kept in the model file.
         licence: licence of the meshes, kept in the model file.
+        parts: number of vertices of each structure of one subject, by name, if the meshes contain several, such as the
+            bones of a joint; their vertices follow one another. The first part is the reference of the others.
+        relative_pose: relative pose of the parts: `modelled`: modes move shapes and poses, with exact rotations
+            (docs/structures.md); `kept`: modes move the vertices of all parts in one frame; `removed`: modes move the
+            shapes of the parts alone. With the gauge `shape` one size of all parts is divided out.
         seed: seed of the cross-validation, and of the first directions of streamed modes.
         out_of_core: stream the meshes, each loaded once and not kept in memory, through a file of single precision as
             large as they are: the same model except for that rounding, with `ShapeModel.residuals`. None does so if a
@@ -88,6 +96,8 @@ class BuildConfig:
     representation: str = "vertices"
     control_points: tuple[int, int] | None = None
     min_seen: float = MIN_SEEN
+    parts: Mapping[str, int] | None = None
+    relative_pose: RelativePose = "modelled"
     provenance: str = ""
     licence: str = ""
     seed: int = 0
@@ -105,9 +115,27 @@ class BuildConfig:
         if self.gauge not in get_args(Gauge):
             raise InputError(f"There is no gauge {self.gauge!r}; choose form (rigid) or shape (with scale).")
         representation_named(self.representation, self.control_points)
+        if self.relative_pose not in get_args(RelativePose):
+            poses = ", ".join(get_args(RelativePose))
+            raise InputError(f"There is no relative pose {self.relative_pose!r}; choose one of {poses}.")
+        if self.parts is not None and len(self.parts) < 2:
+            raise InputError("Parts are the structures of one subject, two or more; omit parts if there is one.")
+        if self.parts and (self.representation != "vertices" or not self.align):
+            raise InputError(
+                "A model of several parts takes vertices, and aligns its meshes; omit --representation and --no-align."
+            )
+        if self.of_part_shapes and self.alignment_vertices is not None:
+            raise InputError(
+                "Parts are aligned by all of their vertices; omit alignment_vertices, or keep relative_pose."
+            )
         if not isinstance(self.min_seen, Real) or not 0 <= self.min_seen <= 1:
             raise InputError(f"min_seen is a share of the meshes from 0 to 1, not {self.min_seen!r}.")
         generator_of(self.seed, "BuildConfig.seed")
+
+    @property
+    def of_part_shapes(self) -> bool:
+        """Whether the shape of each part is separated from its relative pose."""
+        return bool(self.parts) and self.relative_pose != "kept"
 
 
 def build_model(
@@ -149,10 +177,14 @@ def build_model(
     landmarks: Mapping[str, int] = config.landmarks or {}
     meshes = as_meshes(meshes, "build_model")
     kind = representation_named(config.representation, config.control_points)
-    if kind is not Vertices and (config.out_of_core or keep_shapes is not None):
-        raise InputError("Only models of vertices can be built from streamed meshes; omit --representation.")
+    is_plain = kind is Vertices and not config.of_part_shapes
+    if not is_plain and (config.out_of_core or keep_shapes is not None):
+        raise InputError(
+            "Only models of vertices, with the relative pose of parts kept, can be built from streamed meshes; omit "
+            "--representation, or set --relative-pose kept."
+        )
     streaming = ""
-    if kind is Vertices and keep_shapes is None:
+    if is_plain and keep_shapes is None:
         streaming = streaming_note(meshes, modes=config.modes, out_of_core=config.out_of_core)
     if config.out_of_core or keep_shapes is not None or streaming:
         stream = aligned_on_disk(
@@ -171,6 +203,7 @@ def build_model(
         return replace(model, notes=[streaming, *model.notes]) if streaming else model
     meshes = [without_estimates(meshes[index]) for index in range(len(meshes))]
     faces, dropped = common_faces(meshes), np.zeros(0, dtype=np.int32)
+    parts = _regions_of_parts(config.parts or {}, meshes)
     notes = missing_notes(meshes)
     if not kind.takes_holes and len(meshes) > 1:
         observed, given = ObservedMeshes.of(meshes, config.min_seen), landmarks
@@ -178,6 +211,7 @@ def build_model(
         notes += observed.notes(config.min_seen, given)
         faces, alignment_vertices = meshes[0].faces, observed.indices(alignment_vertices)
         dropped = np.flatnonzero(~observed.vertices).astype(np.int32)
+        parts = observed.regions(parts)
     shapes, names = _training_shapes(meshes, faces, fill=kind.takes_holes), [mesh.name for mesh in meshes]
     rounding = rounding_mm(np.nan_to_num(meshes[0].vertices, posinf=0.0, neginf=0.0))
     observed = np.asarray(np.isfinite(shapes).all(axis=2), dtype=np.bool_)
@@ -188,11 +222,21 @@ def build_model(
     sizes = sizes / _centroid_sizes(shapes, observed)
     # Coding overwrites the shapes of B-splines.
     aligned = shapes if kind is Vertices or config.without_training_shapes else shapes.copy()
-    coder = kind.of(Mesh(shapes.mean(axis=0), faces, name="The mean of the meshes"), config.control_points)
+    if config.of_part_shapes and len(parts) > 1:
+        if completed is not None:
+            notes.append(
+                "Vertices that are missing, such as those of missing parts, are estimated from the others before poses "
+                "are measured, so they vary less in the model than in the population."
+            )
+        articulation, shapes, larger = _shapes_of_parts(shapes, [len(part) for part in parts.values()], config)
+        sizes, completed, aligned = sizes * larger, None, shapes
+        coder = Articulated(articulation) if config.relative_pose == "modelled" else Vertices()
+    else:
+        coder = kind.of(Mesh(shapes.mean(axis=0), faces, name="The mean of the meshes"), config.control_points)
     if completed is not None:
         pc = completed.components(config.modes, config.seed)
-    elif isinstance(coder, Vertices):
-        data = coder.encode(shapes)
+    elif isinstance(coder, Vertices | Articulated):
+        data = shapes.reshape(len(shapes), -1)  # of Articulated, tangent vertices
         pc = principal_components(data, number_of_modes(config.modes, data, config.seed))
     else:
         pc = _components_of_codes(coder, shapes, config.modes, config.seed)
@@ -206,10 +250,12 @@ def build_model(
         faces=faces,
         gauge=config.gauge,
         landmarks=landmarks,
-        representation=config.representation,
+        representation="articulated" if isinstance(coder, Articulated) else config.representation,
         provenance=config.provenance,
         licence=config.licence,
         dropped_vertices=dropped,
+        regions=parts,
+        parts=tuple(parts) if len(parts) > 1 else (),
     )
     model = _finish_model(model, aligned.__getitem__, names.__getitem__, sizes, config)
     return replace(model, notes=[*notes, *model.notes])
@@ -305,6 +351,55 @@ def _model_of_streamed(
         if keep_shapes is not None:
             aligned.keep(keep_shapes, model.content_hash)
     return model
+
+
+def _regions_of_parts(parts: Mapping[str, int], meshes: Sequence[Mesh]) -> dict[str, IntArray]:
+    """Return the vertices of each part.
+
+    Raises:
+        InputError: the numbers of vertices are not those of the meshes.
+    """
+    ends = np.cumsum([0, *parts.values()])
+    if parts and meshes and (min(parts.values()) < 1 or ends[-1] != len(meshes[0].vertices)):
+        counts = ", ".join(f"{name} {count}" for name, count in parts.items())
+        raise InputError(
+            f"The parts have {ends[-1]} vertices ({counts}), but {meshes[0].name} has {len(meshes[0].vertices)}; give "
+            "the number of vertices of each part, in the order of the vertices."
+        )
+    return {
+        name: np.arange(start, end, dtype=np.int32) for name, start, end in zip(parts, ends, ends[1:], strict=False)
+    }
+
+
+_TEMPLATE_ROUNDS, _TEMPLATE_STILL = 20, 1e-7
+"""Limit of the iterations of the mean of the parts, and the movement, as a share of the size, that ends them."""
+
+
+def _shapes_of_parts(
+    shapes: FloatArray, counts: Sequence[int], config: BuildConfig
+) -> tuple[Articulation, FloatArray, FloatArray]:
+    """Return the mean of the parts, and the shapes (N, V, 3) as tangent vertices, or with the mean relative pose.
+
+    Also return the size (N,) of each that is divided out, relative to the mean: the root of the sum of the squared
+    centroid sizes of the parts, which does not depend on their relative pose; ones with the gauge `form`.
+    """
+    larger = np.ones(len(shapes))
+    if config.gauge == "shape":
+        ends = np.cumsum(counts)[:-1]
+        larger = np.array([np.linalg.norm([centroid_size(x) for x in np.split(shape, ends)]) for shape in shapes])
+        larger /= larger.mean()
+        shapes = align_shapes(shapes / larger[:, None, None], "form")
+    template = shapes.mean(axis=0)
+    for _ in range(_TEMPLATE_ROUNDS):
+        articulation = Articulation(template, counts)
+        poses = [articulation.poses_of(shape) for shape in shapes]
+        mean = np.mean([articulation.to_tangent(own) for own in poses], axis=0)
+        template = articulation.decode(mean)
+        if np.abs(template - articulation.template).max() <= _TEMPLATE_STILL * np.ptp(template):
+            break
+    if config.relative_pose == "removed":
+        return articulation, articulation.template + np.stack([own.shape for own in poses]), larger
+    return articulation, np.stack([articulation.to_tangent(own) for own in poses]), larger
 
 
 def _centroid_sizes(shapes: FloatArray, observed: BoolArray) -> FloatArray:

@@ -104,6 +104,7 @@ def load_foreign(path: Path, mm: float | None = None, expressions: Path | None =
         "held_out": linear.held_out,
         "residuals": None,
         "regions": {},
+        "parts": (),
         "is_n_training_known": linear.n_training is not None,
         "training": None,
         "dropped_vertices": np.zeros(0, dtype=np.int32),

@@ -37,7 +37,7 @@ _EVERY_MODEL = (
 )  # fmt: skip
 """Arrays and attributes that do not depend on the representation."""
 _LONGEST_DETAIL = 200  # characters of a library's error that a message repeats
-_WHOLE_NUMBERS = ("faces", "control_counts", "degree", _REGIONS, _CORNERS, _DROPPED)
+_WHOLE_NUMBERS = ("faces", "control_counts", "degree", "part_counts", _REGIONS, _CORNERS, _DROPPED)
 
 
 class _FileAttributes(Struct, frozen=True):
@@ -53,6 +53,7 @@ class _FileAttributes(Struct, frozen=True):
     variance_divisor: str
     n_training_known: str
     regions: str = "{}"
+    parts: str = "[]"
     notes: str = "[]"
 
 
@@ -113,6 +114,8 @@ def _contents(model: ModelFields) -> tuple[dict[str, npt.NDArray[Any]], dict[str
     if regions := model["regions"]:
         arrays[_REGIONS] = np.concatenate(list(regions.values()))
         attributes[_REGIONS] = json.dumps({name: len(vertices) for name, vertices in regions.items()})
+    if model["parts"]:
+        attributes["parts"] = json.dumps(model["parts"])
     return arrays, attributes
 
 
@@ -186,6 +189,7 @@ def load(path: Path) -> ModelFields:
             "held_out": attributes_of_file.variance_divisor == _HELD_OUT,
             "residuals": owned.get(_RESIDUALS),
             "regions": _read_regions(attributes_of_file.regions, owned.get(_REGIONS)),
+            "parts": msgspec.convert(plain_json(attributes_of_file.parts), tuple[str, ...]),
             "is_n_training_known": attributes_of_file.n_training_known != "no",
             "training": _training_shapes(owned),
             "dropped_vertices": owned.get(_DROPPED, np.zeros(0, dtype=np.int32)),

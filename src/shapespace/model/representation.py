@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.errors import InputError
+from shapespace.geometry.articulation import Articulation
 from shapespace.geometry.bspline import DEGREE, SplineSquare, check_counts
 from shapespace.geometry.flatten import disc_map
 from shapespace.types import BoolArray, FloatArray, Mesh, read_only
@@ -22,6 +23,8 @@ class Representation(Protocol):
 
     takes_holes: ClassVar[bool]
     """Whether `encode` accepts vertices that are not-a-number."""
+    is_linear: ClassVar[bool]
+    """Whether `decode` is linear except for a constant."""
 
     @classmethod
     def check(cls, control_points: tuple[int, int] | None) -> None:
@@ -66,8 +69,13 @@ class Representation(Protocol):
         """Return the vertices (..., V, 3), mm, of the surfaces that the vectors (..., D) represent."""
         ...
 
-    def directions(self, basis: FloatArray) -> FloatArray:
-        """Return (3V, K) displacements of the vertices along each column of `basis` (D, K)."""
+    def directions(self, basis: FloatArray, at: FloatArray | None = None) -> FloatArray:
+        """Return (3V, K) displacements of the vertices along each column of `basis` (D, K), to first order.
+
+        Args:
+            basis: directions of vectors.
+            at: (D,) vector from which they lead; None for the mean. Only representations that are not linear need it.
+        """
         ...
 
 
@@ -75,6 +83,7 @@ class Vertices:
     """The paper's representation (P1): all coordinates, one vertex after the other, D = 3V."""
 
     takes_holes: ClassVar[bool] = False
+    is_linear: ClassVar[bool] = True
 
     @classmethod
     def check(cls, control_points: tuple[int, int] | None) -> None:
@@ -113,7 +122,7 @@ class Vertices:
         """Return vertices (..., V, 3) from (..., 3V)."""
         return vector.reshape(*vector.shape[:-1], -1, 3)
 
-    def directions(self, basis: FloatArray) -> FloatArray:
+    def directions(self, basis: FloatArray, at: FloatArray | None = None) -> FloatArray:
         """Return `basis` itself."""
         return basis
 
@@ -135,6 +144,7 @@ class BSplineSurface:
     """
 
     takes_holes: ClassVar[bool] = True
+    is_linear: ClassVar[bool] = True
     _keeps_detail: ClassVar[bool] = False
 
     def __init__(self, uv: FloatArray, counts: tuple[int, int], detail: FloatArray | None = None) -> None:
@@ -227,7 +237,7 @@ class BSplineSurface:
             out += self.detail
         return out.reshape(*vector.shape[:-1], -1, 3)
 
-    def directions(self, basis: FloatArray) -> FloatArray:
+    def directions(self, basis: FloatArray, at: FloatArray | None = None) -> FloatArray:
         """Return (3V, K) from `basis` (3mn, K)."""
         D, K = basis.shape
         return self.spline.values(basis.reshape(D // 3, 3 * K)).reshape(-1, K)
@@ -239,10 +249,75 @@ class DetailedBSplineSurface(BSplineSurface):
     _keeps_detail: ClassVar[bool] = True
 
 
+class Articulated:
+    """Tangent vertices of several parts: shapes of the parts and their relative poses, D = 3V (S1-S7).
+
+    Args:
+        parts: the parts in their mean shapes and relative poses.
+    """
+
+    takes_holes: ClassVar[bool] = False
+    is_linear: ClassVar[bool] = False
+
+    def __init__(self, parts: Articulation) -> None:
+        self.parts = parts
+
+    @classmethod
+    def check(cls, control_points: tuple[int, int] | None) -> None:
+        """Raise, since models of several parts are built by another option.
+
+        Raises:
+            InputError: always.
+        """
+        raise InputError(
+            "Models of several parts have the representation articulated if their relative pose is modelled; set "
+            "relative_pose (--relative-pose) instead of the representation."
+        )
+
+    @classmethod
+    def of(cls, template: Mesh, control_points: tuple[int, int] | None) -> Articulated:
+        """Raise as `check` does, since a mesh does not state its parts."""
+        cls.check(control_points)
+        raise AssertionError
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]]) -> Articulated:
+        """Return the representation from its `arrays`.
+
+        Raises:
+            InputError: an array is missing, or they do not belong together.
+        """
+        if missing := [name for name in ("template", "part_counts") if name not in arrays]:
+            raise InputError(f"A model of several parts needs the array {missing[0]!r}.")
+        template, counts = arrays["template"].astype(np.float64), arrays["part_counts"]
+        if template.ndim != 2 or template.shape[1] != 3 or counts.ndim != 1 or not np.isfinite(template).all():
+            raise InputError("The template of a model of several parts must be finite vertices (V, 3).")
+        return cls(Articulation(read_only(template), counts.tolist()))
+
+    def arrays(self) -> Mapping[str, npt.NDArray[Any]]:
+        """Return `template` (V, 3) and `part_counts` (P,)."""
+        return {"template": self.parts.template, "part_counts": np.array(self.parts.counts, dtype=np.int32)}
+
+    def encode(self, vertices: FloatArray) -> FloatArray:
+        """Return (..., 3V) from vertices (..., V, 3) in any pose."""
+        shapes = vertices.reshape(-1, *vertices.shape[-2:])
+        return np.stack([self.parts.encode(shape).ravel() for shape in shapes]).reshape(*vertices.shape[:-2], -1)
+
+    def decode(self, vector: FloatArray) -> FloatArray:
+        """Return vertices (..., V, 3), rigidly aligned to the template, from (..., 3V)."""
+        rows = vector.reshape(-1, len(self.parts.template), 3)
+        return np.stack([self.parts.decode(row) for row in rows]).reshape(*vector.shape[:-1], -1, 3)
+
+    def directions(self, basis: FloatArray, at: FloatArray | None = None) -> FloatArray:
+        """Return `basis` at the template, else the derivatives of `decode` at `at`."""
+        return basis if at is None else self.parts.directions(basis, at.reshape(-1, 3))
+
+
 REPRESENTATIONS: Mapping[str, type[Representation]] = {
     "vertices": Vertices,
     "bspline": BSplineSurface,
     "bspline-detail": DetailedBSplineSurface,
+    "articulated": Articulated,
 }
 """Representations by their names in model files."""
 

@@ -89,6 +89,8 @@ class ShapeModel:
         residuals: (K,) mm^2, |C v - lambda v| of each mode if it was found by passes over the shapes (PCA beyond
             memory); None if the modes are exact to rounding.
         regions: name -> (n,) int32, the vertices of a part of the surface that a fit can be restricted to.
+        parts: names of the structures of one subject, such as bones: regions that follow one another and have all
+            vertices; empty if the surface is one structure.
         is_n_training_known: whether the number of training shapes is known; False for a model of another tool whose
             file does not state it, such as a Gaussian process; `n_training` is then K + 1.
         left_out: number of modes that were omitted, since alignment or rounding alone caused them; it is not saved.
@@ -120,6 +122,7 @@ class ShapeModel:
     left_out: int = 0
     is_n_training_known: bool = True
     regions: Mapping[str, IntArray] = field(default_factory=lambda: dict[str, IntArray]())
+    parts: tuple[str, ...] = ()
     training: TrainingShapes | None = field(default=None, repr=False)
     dropped_vertices: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int32), repr=False)
     notes: Sequence[str] = ()
@@ -187,7 +190,18 @@ class ShapeModel:
         regions = {
             str(name): region_vertices(vertices, len(checked.vertices), name) for name, vertices in self.regions.items()
         }
-        set_fields(self, dropped_vertices=dropped, regions=MappingProxyType(regions), notes=tuple(self.notes))
+        if self.parts:
+            of_parts = [regions[name] for name in self.parts if name in regions]
+            every = np.concatenate([*of_parts, none])
+            if len(of_parts) < max(2, len(self.parts)) or not np.array_equal(every, np.arange(len(checked.vertices))):
+                raise InputError(
+                    f"The parts {', '.join(self.parts)} of a shape model must be two or more of its regions, which "
+                    "follow one another and have all vertices."
+                )
+        set_fields(
+            self, dropped_vertices=dropped, regions=MappingProxyType(regions), notes=tuple(self.notes),
+            parts=tuple(self.parts),
+        )  # fmt: skip
 
     def __getstate__(self) -> dict[str, Any]:
         # For copies, other processes and skops, none of which takes read-only mappings.
@@ -343,7 +357,22 @@ class ShapeModel:
             InputError: more coefficients than modes, or values that are not finite.
         """
         b = self._coefficients(b)
-        return self._coder.decode(self._vector + b @ self._modes[: len(b)])
+        return self._coder.decode(self._vector_of(b))
+
+    def _vector_of(self, b: FloatArray) -> FloatArray:
+        return self._vector + b @ self._modes[: len(b)]
+
+    def directions(self, b: FloatArray) -> FloatArray:
+        """Return (3V, K) displacements of the vertices along each mode at the shape `b` (k,) mm, to first order.
+
+        They are `vertex_basis` for every shape, unless the relative pose of several parts is modelled.
+        """
+        return self.vertex_basis if self.is_linear else self._coder.directions(self.basis, self._vector_of(b))
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether vertices are linear in the coefficients; False if the relative pose of several parts is modelled."""
+        return self._coder.is_linear
 
     def mesh(self, b: npt.ArrayLike = ()) -> Mesh:
         """Return the shape with coefficients `b` (k,) mm as a mesh with the model's triangles and landmarks."""
@@ -403,6 +432,8 @@ class ShapeModel:
             modes: k, the number of modes; None for all.
             noise: s, the variance of a coordinate outside the modes, mm^2; None for `noise_variance`.
         """
+        if not self.is_linear:
+            return self._nearest_of_parts(vertices, modes, noise)
         off, modes_used = vertices - self.mean_vertices, self._vertex_modes[:modes]
         if not np.isnan(vertices).any():
             return modes_used @ off.reshape(-1)
@@ -411,6 +442,23 @@ class ShapeModel:
         noise = max(self.noise_variance, _LEAST_NOISE * self.stddev[0] ** 2) if noise is None else noise
         precision = seen @ seen.T + np.diag(noise / self.stddev[:modes] ** 2)
         return np.asarray(np.linalg.solve(precision, seen @ off[is_observed].reshape(-1)), dtype=np.float64)
+
+    def _nearest_of_parts(self, vertices: FloatArray, modes: int | None, noise: float | None) -> FloatArray:
+        """Return `nearest` by Gauss-Newton steps from the mean, since the vertices are not linear in b (S8)."""
+        variance = self.stddev[:modes] ** 2
+        is_observed: BoolArray = ~np.logical_or.reduce(np.isnan(vertices), axis=1)
+        some = not is_observed.all()
+        noise = max(self.noise_variance, _LEAST_NOISE * variance[0]) if noise is None else noise
+        damping = np.diag(noise / variance) if some else np.zeros((len(variance), len(variance)))
+        b = np.zeros(len(variance))
+        for _ in range(_PROJECTION_ITERATIONS):
+            rows = self.directions(b)[:, :modes].reshape(self.n_vertices, 3, -1)[is_observed].reshape(-1, len(b))
+            off = (vertices - self.reconstruct(b))[is_observed].reshape(-1)
+            step = np.linalg.solve(rows.T @ rows + damping, rows.T @ off - damping @ b)
+            b = b + step
+            if np.abs(step).max() <= _PROJECTION_TOLERANCE * self.stddev[0]:
+                break
+        return b
 
     def to_z(self, b: npt.ArrayLike) -> FloatArray:
         """Return coefficients z (..., k), in standard deviations, of `b` (..., k) in mm; k is at most K."""
@@ -467,8 +515,11 @@ class ShapeModel:
             return self
         stddev = training.stddev[self.n_modes :]
         return dataclasses.replace(
-            self, mean=self.mean_vertices.ravel(), basis=np.concatenate([self.vertex_basis, training.rest], axis=1),
-            stddev=np.concatenate([self.stddev, stddev]), representation="vertices", coding={}, residuals=None,
+            self, mean=self.mean_vertices.ravel() if self.is_linear else self.mean,
+            basis=np.concatenate([self.vertex_basis, training.rest], axis=1),
+            stddev=np.concatenate([self.stddev, stddev]), residuals=None,
+            representation="vertices" if self.is_linear else self.representation,
+            coding={} if self.is_linear else self.coding,
             total_variance=max(self.total_variance, float((self.stddev**2).sum() + (stddev**2).sum())),
             training=dataclasses.replace(training, rest=training.rest[:, :0]),
         )  # fmt: skip

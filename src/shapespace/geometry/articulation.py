@@ -1,0 +1,251 @@
+"""Several parts on one list of vertices: shape of each part, and relative pose at the joints between them.
+
+A surface of parts is converted to tangent vertices and back. Tangent vertices are those of the template, displaced by
+the shape of each part and by small rotations and translations of the parts, to first order: on them PCA is linear, and
+lengths are mm of vertices. Rotations become exact, and parts rigid, in the conversion back. Relative poses are in
+logarithmic coordinates about the template (Rasoulian, Rohling and Abolmaesumi, IEEE TMI 32(2), 2013; Bossa and Olmos,
+MMBIA 2007), measured at the joints. Equation numbers are those of docs/structures.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from shapespace.errors import InputError
+from shapespace.geometry.similarity import fit_similarity
+from shapespace.types import FloatArray, IntArray
+
+_JOINT_SHARE = 0.05
+"""Share of a part's vertices, those nearest to the other part, whose mean is its side of the joint."""
+_FEWEST = 4  # vertices of a part, which determine its pose
+
+
+def _skew(v: FloatArray) -> FloatArray:
+    """Return the matrices (..., 3, 3) of the cross products with v (..., 3)."""
+    out = np.zeros((*v.shape, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    return out - out.swapaxes(-1, -2)
+
+
+def _left_jacobian(omega: FloatArray) -> FloatArray:
+    """Return J (3, 3): exp(omega + d) = exp(J d) exp(omega) to first order in d."""
+    angle, K = float(np.linalg.norm(omega)), _skew(omega)
+    if angle < 1e-4:  # rad; the next term of the series is below rounding
+        return np.eye(3) + K / 2 + K @ K / 6
+    return np.eye(3) + (1 - np.cos(angle)) / angle**2 * K + (angle - np.sin(angle)) / angle**3 * K @ K
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """Where a part is attached to its parent.
+
+    Args:
+        part: index of the part.
+        parent: index of its parent.
+        own: vertices of the part, as indices of all vertices, whose mean is its side of the joint.
+        other: vertices of the parent likewise.
+    """
+
+    part: int
+    parent: int
+    own: IntArray
+    other: IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class PartPoses:
+    """Parts of one surface in their own frames, and the relative poses at the joints.
+
+    Args:
+        shape: (V, 3) displacement of each vertex from the template in the template's frame, without the motion of its
+            part, mm (S1).
+        rotation: (P - 1, 3) rotation vector of each jointed part relative to its parent, about the template, rad (S2).
+        translation: (P - 1, 3) displacement at each joint in the frame of the parent, mm (S3).
+    """
+
+    shape: FloatArray
+    rotation: FloatArray
+    translation: FloatArray
+
+
+class Articulation:
+    """Parts of a surface, in a tree of joints whose root is the first part.
+
+    Args:
+        template: (V, 3) vertices of the mean shape with the parts in their mean relative pose, mm.
+        counts: number of vertices of each part; the vertices of parts follow one another.
+
+    Raises:
+        InputError: numbers that are not those of the vertices, or a part with too few vertices.
+    """
+
+    def __init__(self, template: FloatArray, counts: Sequence[int]) -> None:
+        if len(counts) < 2 or min(counts) < _FEWEST or sum(counts) != len(template):
+            raise InputError(
+                f"Parts with {', '.join(map(str, counts))} vertices are not those of a surface with {len(template)} "
+                f"vertices; give two or more parts, each with {_FEWEST} vertices or more."
+            )
+        self.template, self.counts = template, tuple(int(count) for count in counts)
+        ends = np.cumsum([0, *counts]).tolist()
+        self.slices = tuple(slice(start, end) for start, end in pairwise(ends))
+        self._centred = tuple(template[s] - template[s].mean(axis=0) for s in self.slices)
+        self.joints = self._find_joints()
+        self._gap = tuple(template[j.own].mean(axis=0) - template[j.other].mean(axis=0) for j in self.joints)
+
+    def _find_joints(self) -> tuple[Joint, ...]:
+        """Attach each part to the tree where it is nearest to it, starting from the first part."""
+        parts = [self.template[s] for s in self.slices]
+        trees, nearest = [cKDTree(part) for part in parts], {}
+        for a in range(len(parts)):
+            for b in range(len(parts)):
+                if a != b:
+                    distance, _ = trees[b].query(parts[a])
+                    chosen = np.argsort(distance, kind="stable")[: max(1, round(_JOINT_SHARE * len(distance)))]
+                    nearest[a, b] = chosen.astype(np.int32), float(distance[chosen].mean())
+        joints, attached = list[Joint](), [0]
+        while len(attached) < len(parts):
+            free = [k for k in range(len(parts)) if k not in attached]
+            part, parent = min(
+                ((k, p) for k in free for p in attached), key=lambda pair: nearest[pair][1] + nearest[pair[::-1]][1]
+            )
+            own, other = nearest[part, parent][0], nearest[parent, part][0]
+            joints.append(Joint(part, parent, own + self.slices[part].start, other + self.slices[parent].start))
+            attached.append(part)
+        return tuple(joints)
+
+    @cached_property
+    def levers_mm(self) -> FloatArray:
+        """(P - 1,) RMS movement, mm, of the vertices of each jointed part by a rotation of 1 rad about its joint."""
+        off = [self.template[self.slices[j.part]] - self.template[j.own].mean(axis=0) for j in self.joints]
+        return np.array([np.sqrt(2 / 3 * (x**2).sum(axis=1).mean()) for x in off])
+
+    def poses_of(self, vertices: FloatArray) -> PartPoses:
+        """Return the parts of a surface with `vertices` (V, 3), mm in any pose, and their relative poses (S1-S3).
+
+        Raises:
+            InputError: the vertices of a part are on a line or not finite.
+        """
+        shape, R = np.empty_like(self.template), list[FloatArray]()
+        for s, centred in zip(self.slices, self._centred, strict=True):
+            own = vertices[s] - vertices[s].mean(axis=0)
+            rotation = fit_similarity(centred, own, with_scale=False).rotation
+            shape[s] = own @ rotation - centred  # S1
+            R.append(rotation)
+        relative = [R[j.parent].T @ R[j.part] for j in self.joints]
+        translation = [
+            (vertices[j.own].mean(axis=0) - vertices[j.other].mean(axis=0)) @ R[j.parent] - gap
+            for j, gap in zip(self.joints, self._gap, strict=True)
+        ]
+        return PartPoses(shape, Rotation.from_matrix(relative).as_rotvec(), np.array(translation))  # S2, S3
+
+    def _compose(self, poses: PartPoses) -> tuple[FloatArray, list[FloatArray]]:
+        """Return the vertices (V, 3) and the rotation (3, 3) of each part, in the frame of the first part (S4)."""
+        vertices = self.template + poses.shape
+        R = [np.eye(3)] * len(self.counts)
+        for j, gap, omega, d in zip(self.joints, self._gap, poses.rotation, poses.translation, strict=True):
+            s = self.slices[j.part]
+            R[j.part] = R[j.parent] @ Rotation.from_rotvec(omega).as_matrix()
+            vertices[s] = vertices[s] @ R[j.part].T
+            joint = vertices[j.other].mean(axis=0) + R[j.parent] @ (gap + d)
+            vertices[s] += joint - vertices[j.own].mean(axis=0)
+        return vertices, R
+
+    def to_tangent(self, poses: PartPoses) -> FloatArray:
+        """Return the tangent vertices (V, 3), mm: displacements to first order, without a motion of all parts (S5)."""
+        off, theta = poses.shape.copy(), np.zeros((len(self.counts), 3))
+        for j, gap, omega, d in zip(self.joints, self._gap, poses.rotation, poses.translation, strict=True):
+            s = self.slices[j.part]
+            theta[j.part] = theta[j.parent] + omega
+            off[s] += np.cross(theta[j.part], self._centred[j.part])
+            joint = off[j.other].mean(axis=0) + np.cross(theta[j.parent], gap) + d
+            off[s] += joint - off[j.own].mean(axis=0)
+        return self.template + self._without_motion(off)
+
+    def from_tangent(self, tangent: FloatArray) -> PartPoses:
+        """Return the poses of tangent vertices (V, 3); the inverse of `to_tangent`."""
+        off = tangent - self.template
+        shape, theta = np.empty_like(off), np.empty((len(self.counts), 3))
+        for k, s in enumerate(self.slices):
+            theta[k] = _rotation_of(off[s], self._centred[k], self._inertia[k])
+            shape[s] = off[s] - off[s].mean(axis=0) - np.cross(theta[k], self._centred[k])
+        rotation = [theta[j.part] - theta[j.parent] for j in self.joints]
+        translation = [
+            off[j.own].mean(axis=0) - off[j.other].mean(axis=0) - np.cross(theta[j.parent], gap)
+            for j, gap in zip(self.joints, self._gap, strict=True)
+        ]
+        return PartPoses(shape, np.array(rotation), np.array(translation))
+
+    @cached_property
+    def _inertia(self) -> tuple[FloatArray, ...]:
+        """Inverse inertia (3, 3) of each part about its centroid."""
+        return tuple(np.linalg.inv(_inertia(x)) for x in self._centred)
+
+    @cached_property
+    def _all_parts(self) -> tuple[FloatArray, FloatArray]:
+        """The template about its centroid, and its inverse inertia."""
+        centred = self.template - self.template.mean(axis=0)
+        return centred, np.linalg.inv(_inertia(centred))
+
+    def _without_motion(self, off: FloatArray) -> FloatArray:
+        """Return displacements (V, 3) without the rigid motion of all parts together."""
+        centred, inverse = self._all_parts
+        return off - off.mean(axis=0) - np.cross(_rotation_of(off, centred, inverse), centred)
+
+    def encode(self, vertices: FloatArray) -> FloatArray:
+        """Return the tangent vertices (V, 3) of a surface with `vertices` (V, 3) in any pose."""
+        return self.to_tangent(self.poses_of(vertices))
+
+    def decode(self, tangent: FloatArray) -> FloatArray:
+        """Return the vertices (V, 3) of tangent vertices (V, 3), rigidly aligned to the template (S6)."""
+        vertices = self._compose(self.from_tangent(tangent))[0]
+        return fit_similarity(vertices, self.template, with_scale=False).apply(vertices)
+
+    def directions(self, basis: FloatArray, tangent: FloatArray) -> FloatArray:
+        """Return the derivatives (3V, K) of `decode` at `tangent` (V, 3) along the columns of `basis` (3V, K) (S7)."""
+        V, K = len(self.template), basis.shape[1]
+        off = np.ascontiguousarray(basis.T).reshape(K, V, 3)
+        poses = self.from_tangent(tangent)
+        vertices, R = self._compose(poses)
+        shape, theta = np.empty_like(off), np.empty((len(self.counts), K, 3))
+        for k, s in enumerate(self.slices):
+            theta[k] = np.cross(self._centred[k], off[:, s]).sum(axis=1) @ self._inertia[k]
+            shape[:, s] = (
+                off[:, s] - off[:, s].mean(axis=1, keepdims=True) - np.cross(theta[k][:, None], self._centred[k])
+            )
+        moved, spin = shape.copy(), np.zeros((len(self.counts), K, 3))
+        for j, gap, omega, d in zip(self.joints, self._gap, poses.rotation, poses.translation, strict=True):
+            s, parent = self.slices[j.part], R[j.parent]
+            d_omega = theta[j.part] - theta[j.parent]
+            d_gap = off[:, j.own].mean(axis=1) - off[:, j.other].mean(axis=1) - np.cross(theta[j.parent], gap)
+            spin[j.part] = spin[j.parent] + d_omega @ (parent @ _left_jacobian(omega)).T
+            own = vertices[s] - vertices[j.own].mean(axis=0)
+            moved[:, s] = shape[:, s] @ R[j.part].T + np.cross(spin[j.part][:, None], own)
+            joint = moved[:, j.other].mean(axis=1) + np.cross(spin[j.parent], parent @ (gap + d)) + d_gap @ parent.T
+            moved[:, s] += (joint - moved[:, j.own].mean(axis=1))[:, None]
+        return self._aligned_directions(vertices, moved).reshape(K, -1).T
+
+    def _aligned_directions(self, vertices: FloatArray, moved: FloatArray) -> FloatArray:
+        """Return the derivatives (K, V, 3) after the rigid alignment of `vertices` to the template."""
+        R = fit_similarity(vertices, self.template, with_scale=False).rotation
+        x, d = (vertices - vertices.mean(axis=0)) @ R.T, (moved - moved.mean(axis=1, keepdims=True)) @ R.T
+        # The aligned surface x satisfies sum x cross t = 0, t the template, so d + omega cross x does too.
+        t = self._all_parts[0]
+        M = np.einsum("vi,vi->", x, t) * np.eye(3) - x.T @ t
+        omega = -np.linalg.solve(M.T, np.cross(t, d).sum(axis=1).T).T
+        return d + np.cross(omega[:, None], x)
+
+
+def _inertia(x: FloatArray) -> FloatArray:
+    return (x**2).sum() * np.eye(3) - x.T @ x
+
+
+def _rotation_of(off: FloatArray, centred: FloatArray, inverse_inertia: FloatArray) -> FloatArray:
+    """Return the rotation vector (3,) of the small rigid motion that is nearest to displacements `off` (V, 3)."""
+    return inverse_inertia @ np.cross(centred, off).sum(axis=0)
