@@ -35,6 +35,7 @@ from shapespace.geometry.doctor import repair
 from shapespace.geometry.grooming import Crop
 from shapespace.geometry.landmark_placement import landmarks_in_frame_of
 from shapespace.geometry.normals import rms_size
+from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.interop import MeshLike, as_mesh
 from shapespace.io.landmarks.landmark_io import read_landmarks
 from shapespace.model.region import ModelRegion
@@ -98,10 +99,16 @@ class RegionFit:
         variance = variance_of_new_shapes(full) if fitted.b_covariance is not None else full.stddev**2
         covariance = part.to_covariance(known, full, variance)
         after = np.clip(covariance.diagonal(), 0.0, variance)
-        vertices = fitted.T_scan_model.apply(full.reconstruct(b))
+        T_scan_model, shape = fitted.T_scan_model, full.reconstruct(b)
+        if not full.is_linear:  # the part has its own frame
+            T_scan_model = T_scan_model @ fit_similarity(
+                shape[part.inside], part.model.reconstruct(fitted.b), with_scale=False
+            )
+        vertices = T_scan_model.apply(shape)
         vertices[part.inside] = fitted.vertices_scan_mm
         return replace(
             fitted,
+            T_scan_model=T_scan_model,
             b=b[:k],
             b_stddev=np.sqrt(after)[:k],
             shrinkage=(1.0 - after / variance)[:k],

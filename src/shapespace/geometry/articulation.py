@@ -182,6 +182,23 @@ class Articulation:
         ]
         return PartPoses(shape, np.array(rotation), np.array(translation))
 
+    def shape_of_part(self, tangent: FloatArray, part: slice) -> FloatArray:
+        """Return tangent vertices of one part in its own frame, without its motion.
+
+        Args:
+            tangent: (3V,) tangent vertices, or (3V, K) displacements of them, mm.
+            part: its vertices, one of `slices`.
+
+        Returns:
+            (V', 3, 1) vertices, or (V', 3, K) displacements.
+        """
+        k = self.slices.index(part)
+        off = tangent.reshape(len(self.template), 3, -1)[part]
+        off = off - self.template[part][:, :, None] if tangent.ndim == 1 else off
+        theta = self._inertia[k] @ np.cross(self._centred[k][:, :, None], off, axis=1).sum(axis=0)
+        shape = off - off.mean(axis=0) - np.cross(theta[None], self._centred[k][:, :, None], axis=1)
+        return shape + self.template[part][:, :, None] if tangent.ndim == 1 else shape
+
     @cached_property
     def _inertia(self) -> tuple[FloatArray, ...]:
         """Inverse inertia (3, 3) of each part about its centroid."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from shapespace.errors import InputError
+from shapespace.geometry.articulation import Articulation
 from shapespace.geometry.normals import without_vertices
 from shapespace.io.memory_cache import cached_with_owner
 from shapespace.model.shape_model import ShapeModel, region_vertices
@@ -31,11 +32,14 @@ class ModelRegion:
         model: shape model of the part alone, K' modes.
         inside: (V,) True for the vertices of the complete model that are in the part.
         lift: (K, K') from z of the part to z of the complete model; its columns are orthonormal.
+        reliability: (K',) share of each mode of the part, 0 to 1, that is used to predict the rest of the model; ones if
+            vertices of the part are linear in the coefficients of the complete model.
     """
 
     model: ShapeModel
     inside: BoolArray
     lift: FloatArray
+    reliability: FloatArray
 
     @staticmethod
     def of(full: ShapeModel, region: str | tuple[int, ...]) -> ModelRegion:
@@ -48,7 +52,7 @@ class ModelRegion:
 
     def to_b(self, b: FloatArray, full: ShapeModel) -> FloatArray:
         """Return the coefficients (K,) mm of the complete model for the coefficients `b` (k,) mm of the part."""
-        return full.stddev * (self.lift[:, : len(b)] @ (b / self.model.stddev[: len(b)]))
+        return full.stddev * (self.lift[:, : len(b)] @ (self.reliability[: len(b)] * b / self.model.stddev[: len(b)]))
 
     def to_covariance(self, b_covariance: FloatArray, full: ShapeModel, variance: FloatArray) -> FloatArray:
         """Return the covariance (K, K) mm^2 of the complete model's coefficients, from that of the part's.
@@ -59,10 +63,27 @@ class ModelRegion:
             variance: (K,) prior variances of the complete model's coefficients, mm^2, for the directions that no vertex
                 of the part shows.
         """
-        to = full.stddev[:, None] * self.lift / self.model.stddev
-        unseen = np.eye(len(self.lift)) - self.lift @ self.lift.T
+        to = full.stddev[:, None] * self.lift * self.reliability / self.model.stddev
+        unseen = np.eye(len(self.lift)) - (self.lift * self.reliability) @ self.lift.T
         stddev = np.sqrt(variance)
         return to @ b_covariance @ to.T + stddev[:, None] * unseen * stddev
+
+
+def _in_own_frame(full: ShapeModel, articulation: Articulation, inside: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Return the mean (V', 3) and the modes (3V', K) of vertices of one part without its motion; both are exact.
+
+    Raises:
+        InputError: the vertices belong to several parts, whose relative pose is not linear in the coefficients.
+    """
+    part = next((s for s in articulation.slices if inside[s].sum() == inside.sum()), None)
+    if part is None:
+        raise InputError(
+            f"The relative pose of {', '.join(full.parts)} is modelled, so a region lies in one of them; give one of "
+            "these parts, or vertices of one of them."
+        )
+    own = inside[part]
+    mean, modes = articulation.shape_of_part(full.vector(), part), articulation.shape_of_part(full.basis, part)
+    return mean[own, :, 0], modes[own].reshape(-1, full.n_modes)
 
 
 @cached_with_owner(limit=_MAX_PARTS)
@@ -85,6 +106,8 @@ def _build_part(full: ShapeModel, region: str | tuple[int, ...]) -> ModelRegion:
         if not len(faces):
             raise InputError("No triangle of the model lies in the region; give a region with complete triangles.")
     rows = full.vertex_basis.reshape(full.n_vertices, 3, -1)[inside].reshape(3 * len(mean), -1)
+    if full.articulation is not None:
+        mean, rows = _in_own_frame(full, full.articulation, inside)
     basis, stddev, lift = np.linalg.svd(rows * full.stddev, full_matrices=False)
     significant = stddev > _FAINTEST * stddev[0]
     model = ShapeModel(
@@ -99,4 +122,34 @@ def _build_part(full: ShapeModel, region: str | tuple[int, ...]) -> ModelRegion:
         held_out=full.held_out,
         is_n_training_known=full.is_n_training_known,
     )
-    return ModelRegion(model, inside, lift[significant].T)
+    lift = lift[significant].T
+    reliability = np.ones(len(model.stddev)) if full.is_linear else _reliability(full, lift, model.stddev)
+    return ModelRegion(model, inside, lift, reliability)
+
+
+_RIDGES = np.geomspace(1e-6, 1e2, 25)
+"""Variances that are compared, in units of the first variance of the part."""
+
+
+def _reliability(full: ShapeModel, lift: FloatArray, stddev: FloatArray) -> FloatArray:
+    """Return the share (K',) of each mode of a part that predicts the rest best, by leaving out training shapes.
+
+    All modes of a part determine those of the complete model in the training set, but not in new subjects, since a part
+    does not determine its relative pose. So the prediction is a ridge regression, with the ridge of the smallest error
+    of held-out training shapes; ones without training shapes.
+    """
+    if full.training is None:
+        return np.ones(len(stddev))
+    b = full.training.coefficients[:, : full.n_modes]
+    centred = b - b.mean(axis=0)
+    scores = (centred / full.stddev) @ lift * stddev  # mm of the part
+    left, singular, _ = np.linalg.svd(scores, full_matrices=False)
+
+    def error(ridge: float) -> float:
+        kept = left * (singular**2 / (singular**2 + ridge))
+        leverage = np.minimum(np.einsum("nk,nk->n", kept, left) + 1.0 / len(b), 1.0 - 1e-9)
+        return float((((centred - kept @ (left.T @ centred)) / (1.0 - leverage)[:, None]) ** 2).sum())
+
+    ridges = _RIDGES * singular[0] ** 2
+    ridge = float(ridges[int(np.argmin([error(float(ridge)) for ridge in ridges]))]) / (len(b) - 1)
+    return stddev**2 / (stddev**2 + ridge)

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from shapespace.errors import CorrespondenceError, InputError, ModelFileError
 from shapespace.formats.model_parts import LinearModel
+from shapespace.geometry.articulation import Articulation
 from shapespace.geometry.normals import without_estimates
 from shapespace.geometry.procrustes import Gauge
 from shapespace.geometry.similarity import fit_similarity
@@ -25,7 +26,7 @@ from shapespace.model import model_file
 from shapespace.model.foreign import Foreign, as_linear, is_foreign, load_foreign
 from shapespace.model.missing import MIN_SEEN
 from shapespace.model.pca import Modes
-from shapespace.model.representation import REPRESENTATIONS, Representation
+from shapespace.model.representation import REPRESENTATIONS, Articulated, Representation
 from shapespace.model.training_shapes import TrainingShapes
 from shapespace.types import (
     BoolArray,
@@ -357,9 +358,11 @@ class ShapeModel:
             InputError: more coefficients than modes, or values that are not finite.
         """
         b = self._coefficients(b)
-        return self._coder.decode(self._vector_of(b))
+        return self._coder.decode(self.vector(b))
 
-    def _vector_of(self, b: FloatArray) -> FloatArray:
+    def vector(self, b: npt.ArrayLike = ()) -> FloatArray:
+        """Return the vector (D,) that represents the shape with coefficients `b` (k,) mm; see `Representation`."""
+        b = np.asarray(b, dtype=np.float64)
         return self._vector + b @ self._modes[: len(b)]
 
     def directions(self, b: FloatArray) -> FloatArray:
@@ -367,12 +370,17 @@ class ShapeModel:
 
         They are `vertex_basis` for every shape, unless the relative pose of several parts is modelled.
         """
-        return self.vertex_basis if self.is_linear else self._coder.directions(self.basis, self._vector_of(b))
+        return self.vertex_basis if self.is_linear else self._coder.directions(self.basis, self.vector(b))
 
     @property
     def is_linear(self) -> bool:
         """Whether vertices are linear in the coefficients; False if the relative pose of several parts is modelled."""
         return self._coder.is_linear
+
+    @property
+    def articulation(self) -> Articulation | None:
+        """The parts with their joints, if their relative pose is modelled."""
+        return self._coder.parts if isinstance(self._coder, Articulated) else None
 
     def mesh(self, b: npt.ArrayLike = ()) -> Mesh:
         """Return the shape with coefficients `b` (k,) mm as a mesh with the model's triangles and landmarks."""

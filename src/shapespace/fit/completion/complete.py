@@ -123,8 +123,8 @@ class CompletionConfig:
             raise InputError(f"A distribution needs at least two samples, not {self.samples}.")
         if self.mirror not in ("never", "combined", "alone"):
             raise InputError(f"There is no mirror {self.mirror!r}; choose one of never, combined, alone.")
-        if self.fit.fitting.name != "robust" or self.fit.region is not None:
-            raise InputError("A completion needs a fit of the complete model by the robust method.")
+        if self.fit.fitting.name != "robust":
+            raise InputError("A completion needs a fit by the robust method.")
 
 
 @dataclass(frozen=True)
@@ -343,6 +343,9 @@ def complete(
             f"The model was built from {model.n_training} shapes; a completion needs one of at least {_FEWEST_SHAPES}."
         )
     landmarks = read_landmarks(Path(landmarks)) if isinstance(landmarks, str | PathLike) else landmarks
+    if config.fit.region is not None and config.fit.region not in model.parts:
+        of_parts = f"one of the parts {', '.join(model.parts)}" if model.parts else "no region"
+        raise InputError(f"A completion needs a fit of the complete model, or of a part; give {of_parts}.")
     fit = fit_scan(model, scan, config.fit, landmarks=landmarks, T_scan_model=T_scan_model)
     model = model.with_all_modes
     if config.part is not None:

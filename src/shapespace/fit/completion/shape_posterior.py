@@ -23,9 +23,16 @@ from shapespace.fit.robust.posterior import (
     SCALE,
     Estimate,
     lack_of_new_shapes,
+    small_similarity,
     variance_of_new_shapes,
 )
-from shapespace.fit.robust.prepared_model import LandmarkConstraint, ModelSurface, prepare
+from shapespace.fit.robust.prepared_model import (
+    ArticulatedShape,
+    LandmarkConstraint,
+    LinearShape,
+    ModelSurface,
+    prepare,
+)
 from shapespace.fit.robust.robust_icp import Iterate, Problem, WeightedMatches
 from shapespace.fit.robust.robust_settings import Level, RobustSettings
 from shapespace.fit.scan_target import ScanTarget
@@ -48,6 +55,7 @@ _AMPLITUDES = np.geomspace(1e-4, 100.0, 19)
 _AMPLITUDE_STDDEV, _OF_UNKNOWN_MODEL = 1.0, 3.0
 """Standard deviation of the logarithm of the amplitude, chosen by benchmarks/completion.py on faces and femora; the
 second is for models without a known number of shapes, whose spectrum does not predict the amplitude."""
+_DRAWS = 400  # samples of a covariance of vertices on arcs; standard deviations then have an error of 4 %
 OTHER_SIZE = 4.0  # standard deviations of the training shapes' size
 AS_LIKELY = 3.0  # log density (a factor of 20) within which two explanations of a scan are equally likely
 
@@ -76,6 +84,7 @@ class ShapePosterior:
             settled.
         left_out: errors of the completions of the training shapes, each by a model of the other shapes; None without
             training shapes.
+        shape: shape model with the modes that were free.
     """
 
     T_scan_model: Similarity
@@ -91,6 +100,7 @@ class ShapePosterior:
     n_modes: int
     step: FloatArray
     left_out: LeftOutErrors | None
+    shape: LinearShape
 
     def log_density(self) -> float:
         """Return the log density of scan and shape up to a constant, with as many observations as patches (E9)."""
@@ -100,7 +110,13 @@ class ShapePosterior:
         return -patches * float(np.log(self.mismatch_mm)) - 0.5 * (self.n_modes * self.mean_square_z + size)
 
     def vertex_covariance(self) -> FloatArray:
-        """Return the (V, 3, 3) covariance, mm^2, of each vertex position along the axes of the model's frame (E5)."""
+        """Return the (V, 3, 3) covariance, mm^2, of each vertex position along the axes of the model's frame (E5).
+
+        If the relative pose of parts is modelled, vertices move on arcs, and it is that of samples about the mean.
+        """
+        if isinstance(self.shape, ArticulatedShape):
+            draws = self.draw_displacements(_DRAWS, np.random.default_rng(0)).astype(np.float64)
+            return np.einsum("nvi,nvj->vij", draws, draws) / _DRAWS
         rows = self.rows()
         moved = (rows.reshape(-1, rows.shape[2]) @ self.covariance.astype(np.float32)).reshape(rows.shape)
         return np.asarray(np.einsum("vip,vjp->vij", moved, rows), dtype=np.float64)
@@ -119,8 +135,18 @@ class ShapePosterior:
         """Return (count, V, 3) float32 displacements from the mean surface, mm of the model's frame (E6)."""
         root = root_of(self.covariance)
         draws = (root @ rng.standard_normal((root.shape[1], count))).astype(np.float32)
+        if isinstance(self.shape, ArticulatedShape):
+            return self.displacements(draws.T.astype(np.float64), np.broadcast_to(self.b, (count, len(self.b))))
         rows = self.rows()
         return (rows.reshape(-1, len(root)) @ draws).T.reshape(count, *rows.shape[:2])
+
+    def displacements(self, steps: FloatArray, b: FloatArray) -> Float32Array:
+        """Return the (n, V, 3) float32 displacements, mm, by steps (n, P) of the parameters from shapes `b` (n, K + R)."""
+        out = np.empty((len(b), *self.surface.vertices.shape), dtype=np.float32)
+        for row, step, own in zip(out, steps, b, strict=True):
+            moved = small_similarity(step[:POSE]).apply(self.shape.vertices(own + step[POSE:]))
+            row[:] = moved - self.shape.vertices(own)
+        return out
 
     def main_mode(self) -> FloatArray:
         """Return the (V, 3) displacement of one standard deviation along the first principal component, mm."""
@@ -202,7 +228,7 @@ def shape_posterior(
     return ShapePosterior(
         iterate.T_scan_model, iterate.surface, iterate.b, covariance, line.variance, line.amplitude,
         line.weighted.sigma_mm, line.followed, mismatch_mm, covered_mismatch_mm, model.n_modes, mean - line.theta,
-        left_out,
+        left_out, problem.shape,
     )  # fmt: skip
 
 

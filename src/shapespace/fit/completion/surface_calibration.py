@@ -16,7 +16,7 @@ from shapespace.fit.completion.shape_posterior import ShapePosterior, root_of, s
 from shapespace.fit.robust.kernels import Float32Array
 from shapespace.fit.robust.robust_settings import RobustSettings
 from shapespace.fit.scan_target import ScanTarget
-from shapespace.geometry.similarity import POSE, small_poses
+from shapespace.geometry.similarity import POSE, fit_similarity, small_poses
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, Similarity
 
@@ -167,24 +167,39 @@ def calibrate(posterior: ShapePosterior, model: ShapeModel, missing: BoolArray) 
     rng = np.random.default_rng(0)
     noise = root_of(left.noise) @ rng.standard_normal((len(left.noise), n))
 
-    def moved(parameters: FloatArray) -> Float32Array:
-        fields = (flat @ parameters.T.astype(np.float32)).T.reshape(n, V, 3)
+    def moved(parameters: FloatArray, b: FloatArray) -> Float32Array:
+        if model.is_linear:
+            fields = (flat @ parameters.T.astype(np.float32)).T.reshape(n, V, 3)
+        else:
+            fields = posterior.displacements(parameters, np.pad(b, ((0, 0), (0, len(posterior.b) - b.shape[1]))))
         # The completed surface follows the scan along its normals.
         normals = posterior.surface.normals[~missing].astype(np.float32)
         along = np.einsum("nvd,vd->nv", fields[:, ~missing], normals)
         fields[:, ~missing] -= along[:, :, None] * normals
         return fields
 
-    deviation = (left.known[:, 1:].astype(np.float32) @ model.vertex_basis.T.astype(np.float32)).reshape(n, V, 3)
     mean = model.mean_vertices
+    if model.is_linear:
+        deviation = (left.known[:, 1:].astype(np.float32) @ model.vertex_basis.T.astype(np.float32)).reshape(n, V, 3)
+    else:
+        deviation = np.stack([model.reconstruct(c) for c in left.known[:, 1:]]).astype(np.float32) - np.float32(mean)
     pose = small_poses(mean).reshape(V, 3, POSE)
     pose = pose if posterior.prior_variance[POSE - 1] > 0 else pose[:, :, : POSE - 1]
     from_others = deviation * np.float32(n / (n - 1))
     seen = pose[~missing].reshape(-1, pose.shape[2])
     q = np.linalg.lstsq(seen, from_others[:, ~missing].reshape(n, -1).T, rcond=None)[0]
     mean_errors = (pose.reshape(3 * V, -1) @ q).T.reshape(n, V, 3) - from_others
+    if not model.is_linear:  # large rotations of the mean
+        for row, off in zip(mean_errors, from_others.astype(np.float64), strict=True):
+            T = fit_similarity(mean[~missing], (mean + off)[~missing], with_scale=pose.shape[2] == POSE)
+            row[:] = T.apply(mean) - mean - off
     shapes = (mean + deviation).astype(np.float32)
     mean_errors = mean_errors.astype(np.float32)
     return SurfaceCalibration(
-        shapes, moved(left.errors + noise.T), mean_errors, moved(left.shifts), missing, model.training is not None
+        shapes,
+        moved(left.errors + noise.T, left.known[:, 1:]),
+        mean_errors,
+        moved(left.shifts, np.tile(posterior.b, (n, 1))),
+        missing,
+        model.training is not None,
     )

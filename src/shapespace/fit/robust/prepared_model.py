@@ -9,6 +9,7 @@ import numpy as np
 
 from shapespace.errors import InputError
 from shapespace.fit.robust.kernels import Float32Array, less_sag, meet_into, normals_into, walk_into
+from shapespace.geometry.articulation import Articulation
 from shapespace.geometry.kdtree import KdTree
 from shapespace.geometry.normals import boundary_vertices, rms_size
 from shapespace.geometry.similarity import POSE, small_poses
@@ -179,12 +180,46 @@ class LinearShape:
     mean: FloatArray
     modes: Float32Array
 
+    @staticmethod
+    def of(prepared: PreparedModel) -> LinearShape:
+        """Return the shape model of `prepared`, with the model's own modes."""
+        model = prepared.model
+        if model.articulation is None:
+            return LinearShape(prepared.topology, model.mean_vertices, prepared.modes)
+        return ArticulatedShape(prepared.topology, model.vector([]).reshape(-1, 3), prepared.modes, model.articulation)
+
     def surface(self, b: FloatArray) -> ModelSurface:
         """Return the surface with coefficients `b` (k,) mm of the first k modes (R1)."""
+        return ModelSurface.of(self.topology, self.vertices(b), self.modes)
+
+    def vertices(self, b: FloatArray) -> FloatArray:
+        """Return the vertices (V, 3) mm of `surface`."""
         k = len(b)
         flat = self.modes.reshape(-1, self.modes.shape[2])
         offset = (flat if k == flat.shape[1] else flat[:, :k]) @ b.astype(np.float32)
-        return ModelSurface.of(self.topology, self.mean + offset.reshape(-1, 3), self.modes)
+        return self.mean + offset.reshape(-1, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class ArticulatedShape(LinearShape):
+    """A shape model of several parts, whose tangent vertices are linear in the coefficients (S4-S7).
+
+    Args:
+        articulation: the parts.
+    """
+
+    articulation: Articulation
+
+    def surface(self, b: FloatArray) -> ModelSurface:
+        """Return the surface with coefficients `b` (k,) mm of the first k modes, and the modes at this shape."""
+        tangent = super().vertices(b)
+        flat = self.modes.reshape(-1, self.modes.shape[2])
+        modes = self.articulation.directions(flat, tangent).astype(np.float32).reshape(self.modes.shape)
+        return ModelSurface.of(self.topology, self.articulation.decode(tangent), modes)
+
+    def vertices(self, b: FloatArray) -> FloatArray:
+        """Return the vertices (V, 3) mm with coefficients `b` (k,) mm of the first k modes."""
+        return self.articulation.decode(super().vertices(b))
 
 
 SHARE = 0.03

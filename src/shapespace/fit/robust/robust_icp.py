@@ -65,7 +65,7 @@ from shapespace.fit.search.initialisation import Start
 from shapespace.geometry.closest import on_boundary
 from shapespace.geometry.kdtree import KdTree
 from shapespace.geometry.normals import rms_size
-from shapespace.geometry.similarity import POSE
+from shapespace.geometry.similarity import POSE, small_poses
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Similarity
 
@@ -166,8 +166,7 @@ class Problem:
     ) -> Problem:  # fmt: skip
         """Return the problem with the model's own modes."""
         prior = Prior(prepared.model.stddev, settings.prior, start_scale, settings.scale_stddev if with_scale else 0.0)
-        shape = LinearShape(prepared.topology, prepared.model.mean_vertices, prepared.modes)
-        return Problem(prepared, target, settings, prior, shape, marks)
+        return Problem(prepared, target, settings, prior, LinearShape.of(prepared), marks)
 
     def with_residual_modes(self) -> Problem:
         """Return the problem with the residual modes as well, with the weight `beyond_prior`."""
@@ -632,6 +631,10 @@ def in_span(
         modes: number of modes.
         with_scale: whether the scale is free; False keeps the scale.
     """
+    if not prepared.model.is_linear:
+        return _in_span_of_parts(
+            prepared.model, vertices, estimate, prior_stddev[:modes], uncertainty_mm, with_scale=with_scale
+        )
     P, free = prepared.model.vertex_basis[:, :modes], POSE if with_scale else POSE - 1
     pose, inside = prepared.pose[:, :free], prepared.pose_in_span[:modes, :free]
     noise = uncertainty_mm**2 / 3.0
@@ -648,3 +651,30 @@ def in_span(
     small = small_similarity(delta)
     y = (small.inverse().apply(vertices) - prepared.model.mean_vertices).ravel()
     return Estimate(estimate.T_scan_model @ small, kept_share * (P.T @ y))  # R19
+
+
+_SPAN_ROUNDS, _SPAN_STILL = 20, 1e-6
+"""Limit of the steps of the projection of several parts, and the largest step, in standard deviations, that ends them."""
+
+
+def _in_span_of_parts(
+    model: ShapeModel, vertices: FloatArray, estimate: Estimate, stddev: FloatArray, uncertainty_mm: float,
+    *, with_scale: bool,
+) -> Estimate:  # fmt: skip
+    """Return `in_span` of a model whose vertices are not linear in the coefficients, by Gauss-Newton steps."""
+    free, k = POSE if with_scale else POSE - 1, len(stddev)
+    noise = uncertainty_mm**2 / 3.0
+    pose, b = Similarity.identity(), estimate.b[:k].copy()
+    for _ in range(_SPAN_ROUNDS):
+        x = model.reconstruct(b)
+        rows = np.column_stack([small_poses(x)[:, :free], model.directions(b)[:, :k]])
+        off = (pose.inverse().apply(vertices) - x).ravel()
+        normal, pull = rows.T @ rows, rows.T @ off
+        normal[free:, free:] += np.diag(noise / stddev**2)
+        pull[free:] -= noise * b / stddev**2
+        unit = 1.0 / np.sqrt(normal.diagonal())
+        step = unit * np.linalg.solve(normal * np.outer(unit, unit), unit * pull)
+        pose, b = pose @ small_similarity(np.pad(step[:free], (0, POSE - free))), b + step[free:]
+        if float(np.abs(step[free:] / stddev).max()) < _SPAN_STILL:
+            break
+    return Estimate(estimate.T_scan_model @ pose, b)

@@ -65,7 +65,7 @@ def _model_of_others(complete: ShapeModel, coefficients: FloatArray, i: int, mod
     variance = singular**2 / (len(others) - 1)
     kept = min(modes, int((variance > _ROUNDING * variance[0]).sum()))
     return replace(
-        complete, mean=complete.reconstruct(centre).ravel(), basis=complete.vertex_basis @ axes[:kept].T,
+        complete, mean=complete.vector(centre), basis=complete.basis @ axes[:kept].T,
         stddev=np.sqrt(variance[:kept]), total_variance=float(variance.sum()), n_training=len(others),
-        representation="vertices", coding={}, held_out=False, residuals=None, training=None,
+        held_out=False, residuals=None, training=None,
     )  # fmt: skip
