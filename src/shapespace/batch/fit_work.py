@@ -202,11 +202,12 @@ class FitWork:
         Raises:
             FileError: the model cannot be read, or the results cannot be written.
         """
+        job, model = task.job, _model.get(self.model_hash, self._load)
+        task = replace(task, config=task.config.for_scan(model, job.name))
         if task.resume:
             task, earlier = resumed(task, self.model_hash, self.folder, self.run)
             if earlier is not None:
                 return earlier
-        job, model = task.job, _model.get(self.model_hash, self._load)
         model_source = source_of(self.model_file, self.model_hash, self.folder)
         scan_source, marks_source = job.source(self.folder), None
         try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -81,7 +81,8 @@ def complete_scans(
             try:
                 with job.readable() as file:
                     scan = read_mesh(file)
-                completion = complete(model, scan, config, landmarks=job.landmarks)
+                own = replace(config, fit=config.fit.for_scan(model, job.name))
+                completion = complete(model, scan, own, landmarks=job.landmarks)
             except ShapespaceError as error:
                 if isinstance(error, InputError) and len(jobs) > 1 and not bar.counted:
                     raise  # of the model and the settings, and therefore of all scans

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -100,10 +101,13 @@ class RegionFit:
         covariance = part.to_covariance(known, full, variance)
         after = np.clip(covariance.diagonal(), 0.0, variance)
         T_scan_model, shape = fitted.T_scan_model, full.reconstruct(b)
-        if not full.is_linear:  # the part has its own frame
-            T_scan_model = T_scan_model @ fit_similarity(
-                shape[part.inside], part.model.reconstruct(fitted.b), with_scale=False
-            )
+        if full.articulation is not None:
+            # The part has its own frame and its own shape, which the predicted coefficients only approximate.
+            own = part.model.reconstruct(fitted.b)
+            index = full.articulation.part_with(part.inside)
+            if len(own) == part.inside[full.articulation.slices[index or 0]].size:
+                shape = full.articulation.decode(full.vector(b).reshape(-1, 3), index, own)
+            T_scan_model = T_scan_model @ fit_similarity(shape[part.inside], own, with_scale=False)
         vertices = T_scan_model.apply(shape)
         vertices[part.inside] = fitted.vertices_scan_mm
         return replace(
@@ -212,6 +216,13 @@ class FitConfig:
     def fitting(self) -> Method:
         """The method as an object, even if it was given by name."""
         return method_named(self.method) if isinstance(self.method, str) else self.method
+
+    def for_scan(self, model: ShapeModel, name: str) -> FitConfig:
+        """Return the settings for a scan, restricted to a part of the model if `name` ends in _PART, -PART or .PART."""
+        part = next((part for part in model.parts if re.search(rf"[_.-]{re.escape(part)}$", name, re.IGNORECASE)), None)
+        if part is None or self.region is not None or not self.fitting.calibrated:
+            return self
+        return replace(self, region=part, dense=False)
 
     def limits(self, model: ShapeModel) -> Limits:
         """Return the limits of the method; `auto` frees the scale if the size was removed from the model."""
@@ -482,6 +493,10 @@ def _measure_stages(
         name: Stage(T_scan_mm @ T, b, partial(_measure_distances, model, target, T, b, None, region))
         for name, (T, b) in moments.items()
     }
+    if region is not None and not model.is_linear:
+        own_mm = fitted.vertices_scan_mm
+        measure = partial(_measure_distances, model, target, fitted.T_scan_model, fitted.b, own_mm, region)
+        stages["final"] = replace(stages["final"], measure=measure, vertices=T_scan_mm.apply(own_mm))
     if config.dense:
         stages["dense"] = _dense_stage(model, target, T_scan_mm, fitted, config)
     return stages

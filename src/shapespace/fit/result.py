@@ -17,7 +17,7 @@ from shapespace.fit.diagnostics.failure_model import Chirality, FitEvidence, chi
 from shapespace.fit.diagnostics.reasons import Reason, sentence_of
 from shapespace.fit.iteration_state import MATCHED, SHOWN, IcpState
 from shapespace.fit.scan_target import mm_frame
-from shapespace.geometry.closest import ClosestPoints, DistanceSummary, SurfaceDistances
+from shapespace.geometry.closest import ClosestPoints, DistanceSummary, SurfaceDistances, build_engine
 from shapespace.lazy import OpenViewer, lazy_import
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import describe_briefly, short_repr
@@ -265,6 +265,19 @@ class FitResult:
         vertices = self._vertices(stage)
         landmarks = self.model.landmarks.positions(vertices)
         return Mesh(vertices, self.model.faces, landmarks, self.scan_name, self.colours.get(stage))
+
+    def scan_parts(self) -> IntArray:
+        """Return the part (S,) of the model that each vertex of the scan belongs to, as an index of `model.parts`.
+
+        It is the part whose fitted surface is nearest.
+
+        Raises:
+            InputError: the model has no parts.
+        """
+        if not self.model.parts:
+            raise InputError("The model has no parts; build it from specimens of several parts.")
+        part = np.repeat(np.arange(len(self.model.parts)), [len(self.model.regions[name]) for name in self.model.parts])
+        return part[build_engine(self.surface()).query(self.scan.vertices).vertex].astype(np.int32)
 
     def save(self, folder: str | PathLike[str], name: str = "", *, stages: bool = False) -> Path:
         """Write the files that `shapespace fit` writes, and return the path of the record, NAME.fit.json.

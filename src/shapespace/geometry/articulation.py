@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from shapespace.errors import InputError
 from shapespace.geometry.similarity import fit_similarity
-from shapespace.types import FloatArray, IntArray
+from shapespace.types import BoolArray, FloatArray, IntArray
 
 _JOINT_SHARE = 0.05
 """Share of a part's vertices, those nearest to the other part, whose mean is its side of the joint."""
@@ -102,21 +102,20 @@ class Articulation:
     def _find_joints(self) -> tuple[Joint, ...]:
         """Attach each part to the tree where it is nearest to it, starting from the first part."""
         parts = [self.template[s] for s in self.slices]
-        trees, nearest = [cKDTree(part) for part in parts], {}
+        trees = [cKDTree(part) for part in parts]
+        nearest, gap = dict[tuple[int, int], IntArray](), dict[tuple[int, int], float]()
         for a in range(len(parts)):
             for b in range(len(parts)):
                 if a != b:
-                    distance, _ = trees[b].query(parts[a])
+                    distance: FloatArray = np.asarray(trees[b].query(parts[a])[0], dtype=np.float64)
                     chosen = np.argsort(distance, kind="stable")[: max(1, round(_JOINT_SHARE * len(distance)))]
-                    nearest[a, b] = chosen.astype(np.int32), float(distance[chosen].mean())
+                    nearest[a, b] = (chosen + self.slices[a].start).astype(np.int32)
+                    gap[a, b] = float(distance[chosen].mean())
         joints, attached = list[Joint](), [0]
         while len(attached) < len(parts):
-            free = [k for k in range(len(parts)) if k not in attached]
-            part, parent = min(
-                ((k, p) for k in free for p in attached), key=lambda pair: nearest[pair][1] + nearest[pair[::-1]][1]
-            )
-            own, other = nearest[part, parent][0], nearest[parent, part][0]
-            joints.append(Joint(part, parent, own + self.slices[part].start, other + self.slices[parent].start))
+            pairs = [(k, p) for k in range(len(parts)) if k not in attached for p in attached]
+            part, parent = min(pairs, key=lambda pair: gap[pair] + gap[pair[1], pair[0]])
+            joints.append(Joint(part, parent, nearest[part, parent], nearest[parent, part]))
             attached.append(part)
         return tuple(joints)
 
@@ -182,33 +181,37 @@ class Articulation:
         ]
         return PartPoses(shape, np.array(rotation), np.array(translation))
 
-    def shape_of_part(self, tangent: FloatArray, part: slice) -> FloatArray:
+    def part_with(self, inside: BoolArray) -> int | None:
+        """Return the index of the part that has all vertices of the mask `inside` (V,); None if several have them."""
+        return next((k for k, s in enumerate(self.slices) if inside[s].sum() == inside.sum()), None)
+
+    def shape_of_part(self, tangent: FloatArray, part: int) -> FloatArray:
         """Return tangent vertices of one part in its own frame, without its motion.
 
         Args:
             tangent: (3V,) tangent vertices, or (3V, K) displacements of them, mm.
-            part: its vertices, one of `slices`.
+            part: index of the part.
 
         Returns:
             (V', 3, 1) vertices, or (V', 3, K) displacements.
         """
-        k = self.slices.index(part)
-        off = tangent.reshape(len(self.template), 3, -1)[part]
-        off = off - self.template[part][:, :, None] if tangent.ndim == 1 else off
-        theta = self._inertia[k] @ np.cross(self._centred[k][:, :, None], off, axis=1).sum(axis=0)
-        shape = off - off.mean(axis=0) - np.cross(theta[None], self._centred[k][:, :, None], axis=1)
-        return shape + self.template[part][:, :, None] if tangent.ndim == 1 else shape
+        own, centred = self.template[self.slices[part]][:, :, None], self._centred[part][:, :, None]
+        off = tangent.reshape(len(self.template), 3, -1)[self.slices[part]]
+        off = off - own if tangent.ndim == 1 else off
+        theta = self._inertia[part] @ np.cross(centred, off, axis=1).sum(axis=0)
+        shape = off - off.mean(axis=0) - np.cross(theta[None], centred, axis=1)
+        return shape + own if tangent.ndim == 1 else shape
 
     @cached_property
     def _inertia(self) -> tuple[FloatArray, ...]:
         """Inverse inertia (3, 3) of each part about its centroid."""
-        return tuple(np.linalg.inv(_inertia(x)) for x in self._centred)
+        return tuple(_inverse_inertia(x) for x in self._centred)
 
     @cached_property
     def _all_parts(self) -> tuple[FloatArray, FloatArray]:
         """The template about its centroid, and its inverse inertia."""
         centred = self.template - self.template.mean(axis=0)
-        return centred, np.linalg.inv(_inertia(centred))
+        return centred, _inverse_inertia(centred)
 
     def _without_motion(self, off: FloatArray) -> FloatArray:
         """Return displacements (V, 3) without the rigid motion of all parts together."""
@@ -219,9 +222,18 @@ class Articulation:
         """Return the tangent vertices (V, 3) of a surface with `vertices` (V, 3) in any pose."""
         return self.to_tangent(self.poses_of(vertices))
 
-    def decode(self, tangent: FloatArray) -> FloatArray:
-        """Return the vertices (V, 3) of tangent vertices (V, 3), rigidly aligned to the template (S6)."""
-        vertices = self._compose(self.from_tangent(tangent))[0]
+    def decode(self, tangent: FloatArray, part: int | None = None, own: FloatArray | None = None) -> FloatArray:
+        """Return the vertices (V, 3) of tangent vertices (V, 3), rigidly aligned to the template (S6).
+
+        Args:
+            tangent: (V, 3) tangent vertices, mm.
+            part: index of a part with another shape; None for none.
+            own: (V', 3) vertices of that part as `shape_of_part` returns them.
+        """
+        poses = self.from_tangent(tangent)
+        if part is not None and own is not None:
+            poses.shape[self.slices[part]] = own - self.template[self.slices[part]]
+        vertices = self._compose(poses)[0]
         return fit_similarity(vertices, self.template, with_scale=False).apply(vertices)
 
     def directions(self, basis: FloatArray, tangent: FloatArray) -> FloatArray:
@@ -255,12 +267,12 @@ class Articulation:
         # The aligned surface x satisfies sum x cross t = 0, t the template, so d + omega cross x does too.
         t = self._all_parts[0]
         M = np.einsum("vi,vi->", x, t) * np.eye(3) - x.T @ t
-        omega = -np.linalg.solve(M.T, np.cross(t, d).sum(axis=1).T).T
+        omega: FloatArray = np.asarray(-np.linalg.solve(M.T, np.cross(t, d).sum(axis=1).T).T, dtype=np.float64)
         return d + np.cross(omega[:, None], x)
 
 
-def _inertia(x: FloatArray) -> FloatArray:
-    return (x**2).sum() * np.eye(3) - x.T @ x
+def _inverse_inertia(x: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.inv((x**2).sum() * np.eye(3) - x.T @ x), dtype=np.float64)
 
 
 def _rotation_of(off: FloatArray, centred: FloatArray, inverse_inertia: FloatArray) -> FloatArray:

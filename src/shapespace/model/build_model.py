@@ -389,13 +389,14 @@ def _shapes_of_parts(
         larger = np.array([np.linalg.norm([centroid_size(x) for x in np.split(shape, ends)]) for shape in shapes])
         larger /= larger.mean()
         shapes = align_shapes(shapes / larger[:, None, None], "form")
-    template = shapes.mean(axis=0)
+    articulation = Articulation(shapes.mean(axis=0), counts)
+    poses = [articulation.poses_of(shape) for shape in shapes]
     for _ in range(_TEMPLATE_ROUNDS):
+        before = articulation.template
+        template = articulation.decode(np.mean([articulation.to_tangent(own) for own in poses], axis=0))
         articulation = Articulation(template, counts)
         poses = [articulation.poses_of(shape) for shape in shapes]
-        mean = np.mean([articulation.to_tangent(own) for own in poses], axis=0)
-        template = articulation.decode(mean)
-        if np.abs(template - articulation.template).max() <= _TEMPLATE_STILL * np.ptp(template):
+        if np.abs(template - before).max() <= _TEMPLATE_STILL * np.ptp(template):
             break
     if config.relative_pose == "removed":
         return articulation, articulation.template + np.stack([own.shape for own in poses]), larger

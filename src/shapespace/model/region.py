@@ -24,6 +24,53 @@ _MAX_PARTS = 4
 """Largest number of parts of one model in the cache; the fits of a batch share one."""
 
 
+_RIDGES = np.geomspace(1e-6, 1e2, 25)
+"""Ridges that are compared, in units of the sum of squares of the part's first mode."""
+_MOST_LEVERAGE = 1.0 - 1e-9  # of a shape in a regression
+
+
+@dataclass(frozen=True, eq=False)
+class RegionPrediction:
+    """Ridge regression of the coefficients of a model on those of a part, in the training shapes (S10).
+
+    All modes of a part determine those of the complete model in the training set, but not in new subjects, since a part
+    does not determine its relative pose. So the ridge is that of the smallest error of left-out training shapes.
+
+    Args:
+        scores: (n, K') coefficients of the part, mm, about their mean.
+        coefficients: (n, K) coefficients of the model, mm.
+        errors: (n, K) predictions minus `coefficients`, each by the regression on the other shapes.
+        ridge: mm^2, added to the sums of squares of the scores.
+    """
+
+    scores: FloatArray
+    coefficients: FloatArray
+    errors: FloatArray
+    ridge: float
+
+    @staticmethod
+    def of(scores: FloatArray, coefficients: FloatArray) -> RegionPrediction:
+        """Return the regression with the ridge of the smallest squared error."""
+        scores = scores - scores.mean(axis=0)
+        left, singular, _ = np.linalg.svd(scores, full_matrices=False)
+        centred, n = coefficients - coefficients.mean(axis=0), len(scores)
+
+        def errors(ridge: float) -> FloatArray:
+            kept = left * (singular**2 / (singular**2 + ridge))
+            leverage = np.minimum(np.einsum("nk,nk->n", kept, left) + 1.0 / n, _MOST_LEVERAGE)
+            return (kept @ (left.T @ centred) - centred) / (1.0 - leverage)[:, None]
+
+        found = [(errors(float(ridge)), float(ridge)) for ridge in _RIDGES * singular[0] ** 2]
+        best, ridge = min(found, key=lambda pair: float((pair[0] ** 2).sum()))
+        return RegionPrediction(scores, coefficients, best, ridge)
+
+    def shifts(self, score: FloatArray) -> FloatArray:
+        """Return the changes (n, K) of the prediction from `score` (K',) if each shape is left out in turn."""
+        precision = self.scores.T @ self.scores + self.ridge * np.eye(self.scores.shape[1])
+        influence = 1.0 / len(self.scores) + self.scores @ np.linalg.solve(precision, score)
+        return influence[:, None] * self.errors
+
+
 @dataclass(frozen=True, eq=False)
 class ModelRegion:
     """A part of a model.
@@ -32,14 +79,20 @@ class ModelRegion:
         model: shape model of the part alone, K' modes.
         inside: (V,) True for the vertices of the complete model that are in the part.
         lift: (K, K') from z of the part to z of the complete model; its columns are orthonormal.
-        reliability: (K',) share of each mode of the part, 0 to 1, that is used to predict the rest of the model; ones if
-            vertices of the part are linear in the coefficients of the complete model.
+        prediction: prediction of the complete model from the part, if its relative pose to other parts is modelled and
+            the model contains its training shapes; None otherwise.
     """
 
     model: ShapeModel
     inside: BoolArray
     lift: FloatArray
-    reliability: FloatArray
+    prediction: RegionPrediction | None = None
+
+    @property
+    def reliability(self) -> FloatArray:
+        """(K',) share of each mode of the part, 0 to 1, that is used to predict the rest of the model."""
+        ridge = 0.0 if self.prediction is None else self.prediction.ridge / (len(self.prediction.scores) - 1)
+        return self.model.stddev**2 / (self.model.stddev**2 + ridge)
 
     @staticmethod
     def of(full: ShapeModel, region: str | tuple[int, ...]) -> ModelRegion:
@@ -75,13 +128,13 @@ def _in_own_frame(full: ShapeModel, articulation: Articulation, inside: BoolArra
     Raises:
         InputError: the vertices belong to several parts, whose relative pose is not linear in the coefficients.
     """
-    part = next((s for s in articulation.slices if inside[s].sum() == inside.sum()), None)
+    part = articulation.part_with(inside)
     if part is None:
         raise InputError(
             f"The relative pose of {', '.join(full.parts)} is modelled, so a region lies in one of them; give one of "
             "these parts, or vertices of one of them."
         )
-    own = inside[part]
+    own = inside[articulation.slices[part]]
     mean, modes = articulation.shape_of_part(full.vector(), part), articulation.shape_of_part(full.basis, part)
     return mean[own, :, 0], modes[own].reshape(-1, full.n_modes)
 
@@ -122,34 +175,8 @@ def _build_part(full: ShapeModel, region: str | tuple[int, ...]) -> ModelRegion:
         held_out=full.held_out,
         is_n_training_known=full.is_n_training_known,
     )
-    lift = lift[significant].T
-    reliability = np.ones(len(model.stddev)) if full.is_linear else _reliability(full, lift, model.stddev)
-    return ModelRegion(model, inside, lift, reliability)
-
-
-_RIDGES = np.geomspace(1e-6, 1e2, 25)
-"""Variances that are compared, in units of the first variance of the part."""
-
-
-def _reliability(full: ShapeModel, lift: FloatArray, stddev: FloatArray) -> FloatArray:
-    """Return the share (K',) of each mode of a part that predicts the rest best, by leaving out training shapes.
-
-    All modes of a part determine those of the complete model in the training set, but not in new subjects, since a part
-    does not determine its relative pose. So the prediction is a ridge regression, with the ridge of the smallest error
-    of held-out training shapes; ones without training shapes.
-    """
-    if full.training is None:
-        return np.ones(len(stddev))
-    b = full.training.coefficients[:, : full.n_modes]
-    centred = b - b.mean(axis=0)
-    scores = (centred / full.stddev) @ lift * stddev  # mm of the part
-    left, singular, _ = np.linalg.svd(scores, full_matrices=False)
-
-    def error(ridge: float) -> float:
-        kept = left * (singular**2 / (singular**2 + ridge))
-        leverage = np.minimum(np.einsum("nk,nk->n", kept, left) + 1.0 / len(b), 1.0 - 1e-9)
-        return float((((centred - kept @ (left.T @ centred)) / (1.0 - leverage)[:, None]) ** 2).sum())
-
-    ridges = _RIDGES * singular[0] ** 2
-    ridge = float(ridges[int(np.argmin([error(float(ridge)) for ridge in ridges]))]) / (len(b) - 1)
-    return stddev**2 / (stddev**2 + ridge)
+    lift, prediction = lift[significant].T, None
+    if not full.is_linear and full.training is not None:
+        b = full.training.coefficients[:, : full.n_modes]
+        prediction = RegionPrediction.of((b / full.stddev) @ lift * model.stddev, b)
+    return ModelRegion(model, inside, lift, prediction)

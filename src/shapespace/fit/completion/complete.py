@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from scipy.stats import chi2
 
 from shapespace.errors import FitError, InputError
+from shapespace.fit.completion.part_prediction import PartPrediction, predict_parts
 from shapespace.fit.completion.shape_posterior import AS_LIKELY, OTHER_SIZE, ShapePosterior, shape_posterior
 from shapespace.fit.completion.surface_calibration import SurfaceCalibration, calibrate
 from shapespace.fit.dense.dense_fit import dense_surface
@@ -174,7 +175,8 @@ class Completion:
         knowledge: (V,) int32 code of each vertex in `KNOWLEDGE`.
         stddev_mm: (V,) standard deviation of the position of each vertex, mm of the scan: the root of the sum of the
             variances along three axes.
-        posterior: joint distribution of pose, coefficients and off-model variation.
+        posterior: joint distribution of pose, coefficients and off-model variation; for the scan of one part, the
+            prediction of all parts.
         T_scan_model: pose of the posterior, from the model's frame (mm) to the frame and unit of the scan.
         calibration: completions of the training shapes, each by a model of the other shapes, from which intervals,
             skill and status are estimated; None if the model neither contains nor counts its training shapes.
@@ -193,7 +195,7 @@ class Completion:
     vertices: FloatArray
     knowledge: IntArray
     stddev_mm: FloatArray
-    posterior: ShapePosterior = field(repr=False)
+    posterior: ShapePosterior | PartPrediction = field(repr=False)
     T_scan_model: Similarity = field(repr=False)
     calibration: SurfaceCalibration | None = field(repr=False)
 
@@ -362,6 +364,8 @@ def complete(
         marks_mm = {name: T_mm_scan.apply(point) for name, point in landmarks.items()}
         marks = LandmarkConstraint.of(model, marks_mm, stddev_mm)
     with_scale = config.fit.limits(model).with_scale
+    if config.fit.region is not None:
+        return _complete_from_part(fit, target, T_mm_scan, config)
 
     def posterior_at(fit: FitResult, *, calibrated: bool = True) -> ShapePosterior:
         b = np.pad(fit.b, (0, model.n_modes - len(fit.b)))
@@ -419,6 +423,39 @@ def complete(
     )  # fmt: skip
 
 
+def _complete_from_part(
+    fit: FitResult, target: ScanTarget, T_mm_scan: Similarity, config: CompletionConfig
+) -> Completion:
+    """Complete the scan of one part: the dense surface of the part, and the prediction of the others.
+
+    Raises:
+        FitError: there are reasons to doubt the completion, and `with_doubtful` is not set.
+        InputError: the model does not contain its training shapes.
+    """
+    posterior = predict_parts(fit, T_mm_scan)
+    T, inside = posterior.T_scan_model, posterior.region.inside
+    start = T.apply(posterior.surface.vertices)
+    dense = dense_surface(posterior.model, target, start, T, config.fit.dense_settings)
+    observed = dense.seen & inside
+    calibration = posterior.calibration(~observed)
+    status, reasons = _judge_completion(fit, posterior, calibration, dense.noise_mm, None, config)
+    completed = np.where(inside[:, None], dense.vertices_scan_mm, start)
+    knowledge = np.where(calibration.skill <= 0, UNKNOWABLE, ESTIMATED)
+    knowledge[observed] = OBSERVED
+    others = ", ".join(part for part in fit.model.parts if part != config.fit.region)
+    notes = (
+        f"The scan shows {config.fit.region}; {others} and their relative poses are predicted from it. Of "
+        f"{len(calibration)} training shapes, each held out in turn, {calibration.n_nearer} have a prediction that is "
+        "nearer than the mean shape is.",
+    )
+    variance = np.einsum("vii->v", posterior.vertex_covariance())
+    T_scan_mm = T_mm_scan.inverse()
+    return Completion(
+        fit, status, reasons, (*fit.notes, *notes), config, T_scan_mm.apply(completed), knowledge.astype(np.int32),
+        np.sqrt(variance) * T.scale, posterior, T_scan_mm @ T, calibration,
+    )  # fmt: skip
+
+
 def _find_likeliest_pose(
     fit: FitResult,
     target: ScanTarget,
@@ -467,7 +504,7 @@ def _find_likeliest_pose(
 
 def _judge_completion(
     fit: FitResult,
-    posterior: ShapePosterior,
+    posterior: ShapePosterior | PartPrediction,
     calibration: SurfaceCalibration | None,
     noise_mm: float,
     apart_mm: float | None,
@@ -505,7 +542,7 @@ def _judge_completion(
 
 
 def _find_doubts_by_training_shapes(
-    posterior: ShapePosterior, calibration: SurfaceCalibration, noise_mm: float
+    posterior: ShapePosterior | PartPrediction, calibration: SurfaceCalibration, noise_mm: float
 ) -> list[Reason]:
     """Return how the scan and its completion differ from those of the training shapes, each held out in turn."""
     doubts, scale = list[Reason](), posterior.T_scan_model.scale

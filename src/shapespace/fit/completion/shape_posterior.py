@@ -141,12 +141,12 @@ class ShapePosterior:
         return (rows.reshape(-1, len(root)) @ draws).T.reshape(count, *rows.shape[:2])
 
     def displacements(self, steps: FloatArray, b: FloatArray) -> Float32Array:
-        """Return the (n, V, 3) float32 displacements, mm, by steps (n, P) of the parameters from shapes `b` (n, K + R)."""
-        out = np.empty((len(b), *self.surface.vertices.shape), dtype=np.float32)
-        for row, step, own in zip(out, steps, b, strict=True):
-            moved = small_similarity(step[:POSE]).apply(self.shape.vertices(own + step[POSE:]))
-            row[:] = moved - self.shape.vertices(own)
-        return out
+        """Return (n, V, 3) float32 displacements, mm, by steps (n, P) of the parameters from shapes `b` (n, K + R)."""
+        moved = [
+            small_similarity(step[:POSE]).apply(self.shape.vertices(own + step[POSE:])) - self.shape.vertices(own)
+            for step, own in zip(steps, b, strict=True)
+        ]
+        return np.stack(moved).astype(np.float32)
 
     def main_mode(self) -> FloatArray:
         """Return the (V, 3) displacement of one standard deviation along the first principal component, mm."""

@@ -214,7 +214,8 @@ class ArticulatedShape(LinearShape):
         """Return the surface with coefficients `b` (k,) mm of the first k modes, and the modes at this shape."""
         tangent = super().vertices(b)
         flat = self.modes.reshape(-1, self.modes.shape[2])
-        modes = self.articulation.directions(flat, tangent).astype(np.float32).reshape(self.modes.shape)
+        moved = self.articulation.directions(flat.astype(np.float64), tangent)
+        modes = moved.astype(np.float32).reshape(self.modes.shape)
         return ModelSurface.of(self.topology, self.articulation.decode(tangent), modes)
 
     def vertices(self, b: FloatArray) -> FloatArray:

@@ -654,7 +654,7 @@ def in_span(
 
 
 _SPAN_ROUNDS, _SPAN_STILL = 20, 1e-6
-"""Limit of the steps of the projection of several parts, and the largest step, in standard deviations, that ends them."""
+"""Limit of the steps of the projection of several parts, and the step, in standard deviations, that ends them."""
 
 
 def _in_span_of_parts(

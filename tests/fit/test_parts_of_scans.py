@@ -1,0 +1,133 @@
+"""Fits and completions of scans of several parts of one subject."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import shapespace as ss
+from shapespace.cli import main
+from shapespace.errors import InputError
+from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
+from shapespace.types import Mesh
+
+COUNTS = {"upper": 162, "lower": 162}
+
+
+def ball() -> Mesh:
+    """Return a sphere of 162 vertices."""
+    t = (1 + 5**0.5) / 2
+    vertices = np.array([[-1, t, 0], [1, t, 0], [-1, -t, 0], [1, -t, 0], [0, -1, t], [0, 1, t], [0, -1, -t], [0, 1, -t],
+                         [t, 0, -1], [t, 0, 1], [-t, 0, -1], [-t, 0, 1]], dtype=float)  # fmt: skip
+    faces = np.array([[0, 11, 5], [0, 5, 1], [0, 1, 7], [0, 7, 10], [0, 10, 11], [1, 5, 9], [5, 11, 4], [11, 10, 2],
+                      [10, 7, 6], [7, 1, 8], [3, 9, 4], [3, 4, 2], [3, 2, 6], [3, 6, 8], [3, 8, 9], [4, 9, 5],
+                      [2, 4, 11], [6, 2, 10], [8, 6, 7], [9, 8, 1]])  # fmt: skip
+    for _ in range(2):
+        edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+        unique, inverse = np.unique(edges, axis=0, return_inverse=True)
+        a, b, c = len(vertices) + inverse.reshape(3, -1)
+        vertices = np.concatenate([vertices, vertices[unique].mean(axis=1)])
+        corners = faces.T
+        faces = np.concatenate([np.stack(three, axis=1) for three in (
+            (corners[0], a, c), (corners[1], b, a), (corners[2], c, b), (a, b, c))])  # fmt: skip
+    return Mesh(vertices / np.linalg.norm(vertices, axis=1)[:, None], faces.astype(np.int32))
+
+
+BALL = ball()
+FACES = np.concatenate([np.asarray(BALL.faces), np.asarray(BALL.faces) + 162]).astype(np.int32)
+
+
+def bump(u: np.ndarray, at: list[float], height: list[float]) -> np.ndarray:
+    return np.exp(-4 * ((u - at) ** 2).sum(axis=1))[:, None] * height
+
+
+def make_subjects(count: int, seed: int) -> list[Mesh]:
+    """Return two bones with a hinge; the lower one has the thickness of the upper one."""
+    rng, out = np.random.default_rng(seed), []
+    u = BALL.vertices
+    for i in range(count):
+        a, b, size = 0.12 * rng.normal(), rng.normal(), 1 + 0.04 * rng.normal()
+        angle = np.deg2rad(rng.uniform(0, 40))
+        upper = u * [50.0, 12 * (1 + a), 10.0] + np.column_stack([0 * u[:, 0], 0 * u[:, 0], 3 * b * u[:, 0] ** 2])
+        upper += bump(u, [0.6, 0.8, 0.0], [0.0, 14.0, 4.0]) + bump(u, [-0.7, 0.0, 0.7], [-4.0, 0.0, 10.0])
+        lower = u * [45.0, 9.0, 9 * (1 + a)] + [48.0, 0, 0]
+        lower += bump(u, [-0.6, 0.0, 0.8], [0.0, 3.0, 12.0]) + bump(u, [0.7, 0.7, 0.0], [5.0, 8.0, 0.0])
+        R = Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix()
+        vertices = size * np.concatenate([upper - [51.0, 0, 0], lower @ R.T])
+        pose = Rotation.random(random_state=rng).as_matrix()
+        out.append(Mesh(vertices @ pose.T + rng.normal(size=3) * 50, FACES, name=f"s{i}"))
+    return out
+
+
+@pytest.fixture(scope="module")
+def model() -> ss.ShapeModel:
+    return ss.build_model(make_subjects(40, seed=0), ss.BuildConfig(parts=COUNTS, gauge="form"))
+
+
+def test_a_scan_of_all_parts_is_fitted_in_any_pose_and_flexion_and_its_vertices_get_their_part(model) -> None:
+    rng = np.random.default_rng(1)
+    for scan in make_subjects(3, seed=5):
+        noisy = scan.with_vertices(scan.vertices + 0.1 * rng.normal(size=scan.vertices.shape))
+        fit = ss.fit_scan(model, noisy)
+        off_mm = np.linalg.norm(fit.surface().vertices - scan.vertices, axis=1)
+        assert fit.status == "converged" and off_mm.mean() < 0.5
+        assert (fit.scan_parts() == np.repeat([0, 1], 162)).mean() > 0.95
+
+
+def test_a_scan_of_one_part_predicts_the_other_as_well_as_true_correspondences_do(model) -> None:
+    subjects, errors, inside = make_subjects(12, seed=9), [], []
+    config = ss.CompletionConfig(fit=ss.FitConfig(region="upper"), with_doubtful=True)
+    for subject in subjects:
+        scan = Mesh(subject.vertices[:162], BALL.faces, name="upper")
+        found = ss.complete(model, scan, config)
+        off = (found.vertices - subject.vertices)[162:]
+        errors.append(np.sqrt((off**2).sum(axis=1).mean()))
+        assert np.linalg.norm((found.vertices - subject.vertices)[:162], axis=1).mean() < 0.7
+        local = (found.vertices - subject.vertices) @ found.T_scan_model.rotation
+        covariance = found.posterior.vertex_covariance()
+        squared = np.einsum("vi,vij,vj->v", local, np.linalg.inv(covariance), local)
+        inside.append((squared[162:] < 7.81).mean())  # 95 % of chi squared with 3 degrees of freedom
+        assert np.all(found.knowledge[:162] == 0) and np.all(found.knowledge[162:] != 0)
+        assert any("lower and their relative poses are predicted" in note for note in found.notes)
+    assert np.mean(inside) > 0.8
+    # The flexion is random, so that the mean flexion is the best prediction: 11.5 degrees times the lever.
+    assert np.sqrt(np.mean(np.square(errors))) < 15.0
+
+
+def test_the_surface_of_a_part_is_its_own_and_not_the_nearest_with_likely_relative_pose(model) -> None:
+    subject = make_subjects(1, seed=11)[0]
+    scan = Mesh(subject.vertices[:162], BALL.faces, name="bone")
+    fit = ss.fit_scan(model, scan, ss.FitConfig(region="upper"))
+    assert np.linalg.norm(fit.surface().vertices[:162] - scan.vertices, axis=1).mean() < 0.5
+
+
+def test_the_commands_take_the_part_from_the_name_of_the_file(model, tmp_path, capsys) -> None:
+    subject = make_subjects(1, seed=12)[0]
+    (tmp_path / "scans").mkdir()
+    write_mesh(tmp_path / "scans" / "anna_lower.ply", Mesh(subject.vertices[162:], BALL.faces))
+    model.save(tmp_path / "limb.h5")
+    model_file, scans = str(tmp_path / "limb.h5"), str(tmp_path / "scans")
+    assert main(["complete", model_file, scans, "-o", str(tmp_path / "done"), "--with-doubtful", "--quiet"]) in (0, 1)
+    done = read_mesh(tmp_path / "done" / "anna_lower.ply")
+    assert len(done.vertices) == 324
+    assert np.linalg.norm(done.vertices[162:] - subject.vertices[162:], axis=1).mean() < 0.7
+    assert main(["fit", model_file, scans, "-o", str(tmp_path / "fits"), "--quiet", "--jobs", "1"]) in (0, 1)
+    fitted = read_mesh(tmp_path / "fits" / "anna_lower.fitted.ply")
+    assert np.linalg.norm(fitted.vertices[162:] - subject.vertices[162:], axis=1).mean() < 0.7
+    capsys.readouterr()
+
+
+def test_what_a_part_does_not_give_is_refused_in_one_sentence(model) -> None:
+    subject = make_subjects(1, seed=13)[0]
+    scan = Mesh(subject.vertices[:162], BALL.faces, name="bone")
+    with pytest.raises(InputError, match="a region lies in one of them"):
+        ss.fit_scan(model, scan, ss.FitConfig(region=tuple(range(100, 300))))
+    with pytest.raises(InputError, match="one of the parts upper, lower"):
+        ss.complete(model, scan, ss.CompletionConfig(fit=ss.FitConfig(region="middle")))
+    shared = ss.build_model(
+        make_subjects(12, seed=0), ss.BuildConfig(parts=COUNTS, gauge="form", without_training_shapes=True)
+    )
+    with pytest.raises(InputError, match="training shapes"):
+        ss.complete(shared, scan, ss.CompletionConfig(fit=ss.FitConfig(region="upper"), with_doubtful=True))
+    one = ss.build_model(make_subjects(8, seed=0), ss.BuildConfig(gauge="form"))
+    with pytest.raises(InputError, match="no parts"):
+        ss.fit_scan(one, subject).scan_parts()
