@@ -32,6 +32,7 @@ from shapespace.fit.search.initialisation import (
     start_of_any_size,
 )
 from shapespace.geometry.closest import ClosestPoints, SurfaceDistances, surface_distances
+from shapespace.geometry.contact import find_penetrations
 from shapespace.geometry.doctor import repair
 from shapespace.geometry.grooming import Crop
 from shapespace.geometry.landmark_placement import landmarks_in_frame_of
@@ -352,6 +353,7 @@ def fit_scan(
             *_note_large_coefficients(model, fitted.b),
             *_note_no_triangles(placed.scan),
             *_note_unobserved(stages),
+            *_note_penetrations(model, fitted),
             *fitted.notes,
         ],
         seconds={
@@ -512,10 +514,23 @@ def _landmark_stddev_mm(
     landmarks = model.landmarks if held is None else held.landmarks(model)
     if not dense:
         # The surface was projected onto the model's modes, and the projection moves a landmark away from its position.
-        modes = landmarks.interpolate(model.vertex_basis.reshape(model.n_vertices, 3, -1))[:, :, : len(fitted.b)]
-        in_modes = fitted.T_scan_model.apply(landmarks.interpolate(model.mean_vertices) + modes @ fitted.b)
+        in_modes = fitted.T_scan_model.apply(landmarks.interpolate(model.reconstruct(fitted.b)))
         variance += (in_modes - landmarks.interpolate(fitted.vertices_scan_mm)) ** 2
     return dict(zip(landmarks, np.sqrt(variance), strict=True))
+
+
+def _note_penetrations(model: ShapeModel, fitted: Fitted) -> list[str]:
+    """Return a sentence on each part of the fitted surface that lies inside another by more than the expected error."""
+    if not model.parts or model.faces is None or fitted.evidence is None:
+        return []
+    surface = Mesh(fitted.vertices_scan_mm, model.faces)
+    found = find_penetrations(surface, {part: model.regions[part] for part in model.parts})
+    return [
+        f"{100 * one.share:.1f} % of the vertices of {one.part} lie inside {one.other}, by up to {one.depth_mm:.1f} mm; "
+        "the parts of a subject do not."
+        for one in found
+        if one.depth_mm > fitted.evidence.posterior_error_mm
+    ]
 
 
 def _region_settings(vertices: tuple[int, ...]) -> dict[str, Any]:
