@@ -411,7 +411,8 @@ class Shapes:
         out = np.zeros((len(part.drawn), len(counts), 2))
         for row, b in enumerate(self.drawn[list(part.drawn)]):
             for column, k in enumerate(counts):
-                out[row, column] = self.nearest.off(mean + (b[:k] @ modes[:k]).reshape(-1, 3))
+                shape = mean + (b[:k] @ modes[:k]).reshape(-1, 3) if model.is_linear else model.reconstruct(b[:k])
+                out[row, column] = self.nearest.off(shape)
         return out
 
 
@@ -713,9 +714,8 @@ def floor_mm(model: ShapeModel, truth: FloatArray) -> float:
     Pose and coefficients are solved for together: alternating between them is slow if modes contain pose or size.
     """
     b, T = model.project(truth, align=False), Similarity.identity()
-    modes = model.vertex_basis.reshape(-1, 3, model.n_modes)
     for _ in range(_STEPS):
-        shape = T.apply(model.reconstruct(b))
+        shape, modes = T.apply(model.reconstruct(b)), model.directions(b).reshape(-1, 3, model.n_modes)
         arm = shape - T.translation
         turn = np.cross(np.eye(3), arm[:, None]).transpose(0, 2, 1)
         move = np.broadcast_to(np.eye(3), turn.shape)
