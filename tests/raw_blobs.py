@@ -28,12 +28,18 @@ class RawBlob:
         return found / np.linalg.norm(found, axis=1, keepdims=True)
 
 
-def raw_blob(k: int, *, T: Similarity | None = None, points: int = 2500, noise_mm: float = 0.2) -> RawBlob:
-    """Return blob number `k`, in any pose."""
+ANY_POSE = 180.0
+"""Largest rotation of scans in any pose, degrees; the search for their poses takes most of the time of a test."""
+
+
+def raw_blob(
+    k: int, *, T: Similarity | None = None, degrees: float = 20.0, points: int = 2500, noise_mm: float = 0.2
+) -> RawBlob:
+    """Return blob number `k`, rotated by up to `degrees`, as scans of one device are."""
     rng = np.random.default_rng([3, k])
     directions, faces = sphere(points, 0.37 * (k + 1))
     vertices = blob(directions, rng.standard_normal(5))
-    T = T or random_similarity(rng, 180.0)
+    T = T or random_similarity(rng, degrees)
     truth = Mesh(T.apply(vertices), faces)
     noisy = T.apply(vertices + noise_mm * rng.standard_normal(vertices.shape))
     return RawBlob(Mesh(noisy, faces, name=f"blob{k}"), truth, directions)

@@ -1,8 +1,11 @@
+import re
 from graphlib import TopologicalSorter
 from importlib import metadata
+from pathlib import Path
 
 import grimp
 
+import shapespace
 from shapespace.version import __version__
 
 
@@ -16,3 +19,10 @@ def test_no_modules_import_each_other_in_a_circle_not_even_for_their_types() -> 
 
 def test_the_version_of_the_files_is_that_of_the_package() -> None:
     assert metadata.version("shapespace") == __version__
+
+
+def test_no_module_loads_all_distributions_of_scipy_as_it_is_imported() -> None:
+    # scipy.stats takes half a second, and a process that fits needs four functions, which are in scipy.special too.
+    source = Path(shapespace.__file__).parent
+    loads = re.compile(r"^(from scipy\.stats|import scipy\.stats|from scipy import .*\bstats\b)", re.MULTILINE)
+    assert [str(path) for path in source.rglob("*.py") if loads.search(path.read_text(encoding="utf-8"))] == []

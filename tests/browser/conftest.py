@@ -21,6 +21,7 @@ FLAGS = [
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
     "--ignore-gpu-blocklist",
+    "--disable-gpu-compositing",
     "--disable-quic",
     "--no-first-run",
     "--disable-background-networking",
@@ -29,7 +30,7 @@ FLAGS = [
     "--hide-scrollbars",
     "--force-color-profile=srgb",
 ]
-"""WebGL by the processor, and no talk with anybody's servers."""
+"""WebGL by the processor, which would compose the page too, at half the time of its process; no talk with servers."""
 
 SCREENSHOTS = Path(os.environ.get("SHAPESPACE_SCREENSHOTS", Path(__file__).resolve().parents[2] / "screenshots-out"))
 

@@ -114,8 +114,11 @@ def test_landmarks_are_placed_by_clicks_drags_keys_and_files(open_tab, tmp_path:
         tab.until(f"Number(document.querySelector('[data-testid=mark-z]').value) === {moved[2]}")
         tab.page.get_by_test_id("mark-x").fill("1,5")
         tab.page.get_by_test_id("mark-x").press("Enter")
-        assert placed(tab, project, "bone_000", "shaft", moved)[0] == 1.5
+        typed = placed(tab, project, "bone_000", "shaft", moved)
+        assert typed[0] == 1.5
         tab.page.get_by_test_id("mark-undo").click()
+        assert np.array_equal(placed(tab, project, "bone_000", "shaft", typed), moved)
+        tab.until(f"Number(document.querySelector('[data-testid=mark-x]').value) === {moved[0]}")
         tab.page.get_by_test_id("mark-remove").click()
         tab.until("document.querySelector('[data-testid=mark-x]').value === ''")
         for axis, value in zip("xyz", moved, strict=True):

@@ -16,6 +16,8 @@ from pages import PANE, hear_signals
 from pictures import change, drawn_share, same_as_kept
 
 from shapespace.cli import main
+from shapespace.datasets import organs
+from shapespace.datasets.simulated_scan import random_similarity
 from shapespace.model.shape_model import ShapeModel
 from shapespace.viewer.studio.project import Project, with_cells
 
@@ -204,8 +206,11 @@ def turn_scan(tab) -> None:
     view.wait_for(state="detached")
 
 
-def write_bones(folder: Path, count: int) -> Path:
-    assert main(["data", "bones", "-o", str(folder), "--count", str(count), "--quiet"]) == 0
+def write_bones(folder: Path, count: int, degrees: float = 180.0) -> Path:
+    """Write bones rotated by up to `degrees`; in any pose, the search for the poses takes most of the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(organs, "random_similarity", lambda rng, _, scales: random_similarity(rng, degrees, scales))
+        assert main(["data", "bones", "-o", str(folder), "--count", str(count), "--quiet"]) == 0
     return folder
 
 

@@ -12,6 +12,7 @@ import pytest
 from shapespace.cli import main
 from shapespace.correspondence.groupwise import correspond
 from shapespace.correspondence.landmark_guide import with_own_landmarks
+from shapespace.correspondence.register import ElasticSettings
 from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.errors import InputError
 from shapespace.fit.fit_scan import FitConfig, fit_scan
@@ -194,7 +195,8 @@ def test_a_correspondence_carries_the_note_that_landmarks_were_turned() -> None:
         scans.append(Mesh(SCAN.vertices * (1, bump, 1), SCAN.faces, marks, f"s{k}"))
     points = {name: point * RAS_TO_LPS for name, point in scans[1].landmarks.items()}
     scans[1] = Mesh(scans[1].vertices, scans[1].faces, points, "s1")
-    config = CorrespondConfig(vertices=300, rounds=1, mirror="never")
+    quick = ElasticSettings(harmonics=60, points=500, iterations=10)
+    config = CorrespondConfig(vertices=300, rounds=1, mirror="never", first=quick, next=quick)
     made = correspond(scans, config)
     assert [["half turn" in note for note in scan.notes] for scan in made.scans] == [[], [True], []]
     assert made.scans[1].landmarks < 0.05 * rms_size(SCAN.vertices)  # which are on the right side

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial import Delaunay
 
 import shapespace as ss
-from raw_blobs import dispersion_mm, raw_blob, without_ball
+from raw_blobs import ANY_POSE, dispersion_mm, raw_blob, without_ball
 from shapespace.cli import main
 from shapespace.correspondence.correspondence_result import Correspondence, copies, unit_ratios
 from shapespace.correspondence.register import ElasticSettings
@@ -26,6 +26,7 @@ QUICK = ElasticSettings(harmonics=150, points=1000)
 ONE_ROUND = CorrespondConfig(vertices=500, rounds=1, mirror="never", first=QUICK, next=QUICK)
 BLOBS = [raw_blob(k, points=1200) for k in range(4)]
 SCANS = [one.scan for one in BLOBS]
+IN_ANY_POSE = [raw_blob(k, degrees=ANY_POSE, points=1200) for k in range(4)]
 
 
 def scans_with(other: Mesh) -> list[Mesh]:
@@ -41,17 +42,20 @@ def plain() -> list[FloatArray]:
     return placed(ss.correspond(SCANS, ONE_ROUND, template=SCANS[0]))
 
 
-def test_points_without_triangles_are_put_where_their_meshes_are(plain: list[FloatArray]) -> None:
-    clouds = [Mesh(scan.vertices, None, name=scan.name) for scan in SCANS]
-    made = ss.correspond(clouds, ONE_ROUND, template=SCANS[0])
-    for mesh, cloud in zip(plain, placed(made), strict=True):
+def test_points_without_triangles_are_put_where_their_meshes_are() -> None:
+    scans = [one.scan for one in IN_ANY_POSE]
+    meshes = placed(ss.correspond(scans, ONE_ROUND, template=scans[0]))
+    clouds = [Mesh(scan.vertices, None, name=scan.name) for scan in scans]
+    made = ss.correspond(clouds, ONE_ROUND, template=scans[0])
+    for mesh, cloud in zip(meshes, placed(made), strict=True):
         assert np.nanmean(np.linalg.norm(cloud - mesh, axis=1)) < 1.0
-    assert dispersion_mm(BLOBS, placed(made)) < 1.1 * dispersion_mm(BLOBS, plain)
+    assert dispersion_mm(IN_ANY_POSE, placed(made)) < 1.1 * dispersion_mm(IN_ANY_POSE, meshes)
 
 
 def test_a_whole_object_of_another_kind_is_no_template_of_open_scans(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shapespace.correspondence.template.MODES", 15)
-    scans = [without_ball(scan, scan.vertices[np.argmax(scan.vertices[:, 0])], 45.0) for scan in SCANS[:3]]
+    cut = [one.scan for one in IN_ANY_POSE[:3]]
+    scans = [without_ball(scan, scan.vertices[np.argmax(scan.vertices[:, 0])], 45.0) for scan in cut]
     directions, faces = sphere(700)
     choice = choose_template([Mesh(1e3 * directions, faces, name="ball"), *scans], 0)
     assert choice.index != 0 and np.nanargmax(choice.nearness) == 0

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import shapespace as ss
-from raw_blobs import LANDMARKS, RawBlob, dispersion_mm, marked, raw_blob
+from raw_blobs import ANY_POSE, LANDMARKS, RawBlob, dispersion_mm, marked, raw_blob
 from shapespace.correspondence.first_template import first_template
 from shapespace.correspondence.groupwise import correspond
 from shapespace.correspondence.harmonics import Harmonics
@@ -31,7 +31,7 @@ FLIP = np.array([-1.0, 1.0, 1.0])
 
 @pytest.fixture(scope="module")
 def blobs() -> list[RawBlob]:
-    return [raw_blob(k) for k in range(6)]
+    return [raw_blob(k, degrees=ANY_POSE) for k in range(6)]
 
 
 def cut(one: RawBlob, share: float) -> Mesh:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import shapespace as ss
-from raw_blobs import raw_blob
+from raw_blobs import ANY_POSE, raw_blob
 from shapespace.cli import main
 from shapespace.commands import correspond as commands
 from shapespace.correspondence.correspondence_result import Correspondence
@@ -74,12 +74,15 @@ def other_blob(k: int, points: int) -> Mesh:
 
     vertices = blob(directions, rng.standard_normal(5)) * [1.15, 0.85, 1.0]
     vertices += 40 * bump((1, 0.2, -0.4), 0.08) - 25 * bump((-0.3, 1, -0.2), 0.1) - 30 * bump((0, -0.1, 1), 0.05)
-    return Mesh(random_similarity(rng, 180.0).apply(vertices), faces, name=f"other{k}")
+    return Mesh(random_similarity(rng, ANY_POSE).apply(vertices), faces, name=f"other{k}")
 
 
 @pytest.fixture(scope="module")
 def mixed() -> list[Mesh]:
-    return [*(raw_blob(k, points=700).scan for k in range(9)), *(other_blob(k, 700) for k in range(6))]
+    return [
+        *(raw_blob(k, degrees=ANY_POSE, points=700).scan for k in range(9)),
+        *(other_blob(k, 700) for k in range(6)),
+    ]
 
 
 @pytest.mark.long

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import shapespace as ss
-from raw_blobs import dispersion_mm, marked, raw_blob
+from raw_blobs import ANY_POSE, dispersion_mm, marked, raw_blob
 from shapespace.cli import main
 from shapespace.correspondence.groupwise import correspond
 from shapespace.correspondence.register import ElasticSettings
@@ -23,7 +23,7 @@ from synthetic_shapes import blob, sphere
 QUICK = ElasticSettings(harmonics=60, points=500, iterations=10)
 CONFIG = CorrespondConfig(vertices=300, rounds=1, first=QUICK, next=QUICK)
 MIRRORED = (1, 4)
-BLOBS = [raw_blob(k, points=700) for k in range(6)]
+BLOBS = [raw_blob(k, degrees=ANY_POSE, points=700) for k in range(6)]
 
 
 def mixed(mirrored: tuple[int, ...] = MIRRORED) -> list[Mesh]:
@@ -133,7 +133,7 @@ def test_surfaces_of_mirrored_scans_are_in_their_frames_and_build_reflects_them(
     np.testing.assert_array_equal(own.faces, image.faces[:, ::-1])
     assert build_engine(mixed()[1]).query(image.vertices).distance.mean() < 0.5
     before = image.vertices
-    write_mesh(tmp_path / "new.ply", mirror_image(raw_blob(6, points=700).scan))
+    write_mesh(tmp_path / "new.ply", mirror_image(raw_blob(6, degrees=ANY_POSE, points=700).scan))
     added = ["correspond", str(tmp_path / "new.ply"), "--add", "-o", str(tmp_path / "mixed-same")]
     assert main([*added, "--jobs", "1", "--quiet"]) == 0
     run = CorrespondenceRecord.from_json(json.loads((tmp_path / "mixed-same/correspondence.json").read_text()))

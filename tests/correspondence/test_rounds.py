@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import shapespace as ss
-from raw_blobs import RawBlob, dispersion_mm, raw_blob, without_ball
+from raw_blobs import ANY_POSE, RawBlob, dispersion_mm, raw_blob, without_ball
 from shapespace.correspondence.correspondence_result import Correspondence
 from shapespace.correspondence.register import ElasticSettings
 from shapespace.correspondence.settings import CorrespondConfig
@@ -21,7 +21,7 @@ OTHER = BLOBS
 
 @pytest.fixture(scope="module")
 def blobs() -> list[RawBlob]:
-    return [raw_blob(k) for k in range(BLOBS)]
+    return [raw_blob(k, degrees=ANY_POSE) for k in range(BLOBS)]
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi
+from scipy.special import gammaincinv
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.errors import InputError
@@ -136,7 +136,7 @@ def align_robustly(moving: FloatArray, fixed: FloatArray, area: FloatArray) -> t
     size_mm = float(np.linalg.norm(np.ptp(fixed, axis=0)))
     order = np.argsort(residual, kind="stable")
     quantile = float(residual[order][np.searchsorted(np.cumsum(a[order]), KEPT_SHARE)])
-    spread_mm = max(quantile / float(chi.ppf(KEPT_SHARE, 3)), _SMALLEST * size_mm)
+    spread_mm = max(quantile / float(np.sqrt(2 * gammaincinv(1.5, KEPT_SHARE))), _SMALLEST * size_mm)
     weights = area
     for _ in range(_ROUNDS):
         residual = np.linalg.norm(T.apply(moving) - fixed, axis=1)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.reprs import list_briefly, short_repr
@@ -316,5 +316,5 @@ def change_or_rate(subject: SubjectChange, *, rate: bool) -> ChangeEstimate:
 
 def interval_of_mean(values: FloatArray) -> tuple[float, float]:
     """Return the 95 % interval of the mean of two or more values, by Student's t."""
-    half = float(student.ppf(0.975, len(values) - 1)) * float(values.std(ddof=1)) / np.sqrt(len(values))
+    half = float(stdtrit(len(values) - 1, 0.975)) * float(values.std(ddof=1)) / np.sqrt(len(values))
     return float(values.mean() - half), float(values.mean() + half)

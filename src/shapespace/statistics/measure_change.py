@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.table import list_names
@@ -206,7 +206,7 @@ class _SubjectDraft:
     def subject(self, group: str, repeatability: Repeatability | None) -> SubjectChange:
         estimates = list(self.estimates)
         if repeatability is not None:
-            quantile = float(student.ppf(0.975, repeatability.freedom))
+            quantile = float(stdtrit(repeatability.freedom, 0.975))
             estimates = [
                 replace(
                     estimate,

@@ -93,10 +93,10 @@ def pool_p_values(p: FloatArray, least: float) -> tuple[FloatArray, FloatArray]:
     Returns:
         p (...), and the fraction of missing information.
     """
-    from scipy.stats import norm  # loads much
+    from scipy.special import ndtr, ndtri  # loads much
 
-    pooled = pool_estimates(norm.isf(np.clip(p, least, 1 - least)), 1.0)  # S75
-    return norm.sf(pooled.value / np.sqrt(pooled.variance)), pooled.missing_information  # S76
+    pooled = pool_estimates(-ndtri(np.clip(p, least, 1 - least)), 1.0)  # S75
+    return ndtr(-pooled.value / np.sqrt(pooled.variance)), pooled.missing_information  # S76
 
 
 def pool_intervals(figures: FloatArray, level: float) -> FloatArray:
@@ -109,13 +109,13 @@ def pool_intervals(figures: FloatArray, level: float) -> FloatArray:
     Returns:
         The same (..., 3), combined.
     """
-    from scipy.stats import norm, t  # loads much
+    from scipy.special import ndtri, stdtrit  # loads much
 
     values, tail = figures[..., 0], (1 + level) / 2
     ends: list[FloatArray] = []
     for column, sign in ((1, -1.0), (2, 1.0)):
-        pooled = pool_estimates(values, ((figures[..., column] - values) / norm.ppf(tail)) ** 2)
-        ends.append(pooled.value + sign * t.ppf(tail, pooled.df) * np.sqrt(pooled.variance))
+        pooled = pool_estimates(values, ((figures[..., column] - values) / ndtri(tail)) ** 2)
+        ends.append(pooled.value + sign * stdtrit(pooled.df, tail) * np.sqrt(pooled.variance))
     return np.stack([values.mean(axis=0), *ends], axis=-1)
 
 

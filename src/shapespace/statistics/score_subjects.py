@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial.distance import cdist
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.table import list_names
@@ -450,7 +450,7 @@ class _Population:
     def p_value(self, squared: float) -> float:
         """Return the chance of a squared distance as large by the F distribution."""
         q, n = self.modes, self.people
-        return float(f_distribution.sf(squared * (n - q) / ((n - 1) * q), q, n - q))  # S53
+        return float(fdtrc(q, n - q, squared * (n - q) / ((n - 1) * q)))  # S53
 
 
 @dataclass(frozen=True, eq=False)

@@ -307,9 +307,9 @@ def predict_shapes(
 
 def _interval_factor(df: FloatArray, confidence: float) -> FloatArray:
     """Return half the widths of intervals in standard errors; NaN if not known."""
-    from scipy.stats import t  # loads much
+    from scipy.special import stdtrit  # loads much
 
-    return np.where(df >= _LEAST_DF, t.ppf((1 + confidence) / 2, df), np.nan)
+    return np.where(df >= _LEAST_DF, stdtrit(df, (1 + confidence) / 2), np.nan)
 
 
 def percentiles(y: FloatArray, codes: IndexArray, percent: tuple[float, float]) -> tuple[float, float]:

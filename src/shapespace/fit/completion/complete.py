@@ -15,7 +15,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from shapespace.errors import FitError, InputError
 from shapespace.fit.completion.part_prediction import PartPrediction, predict_parts
@@ -521,7 +521,7 @@ def _judge_completion(
     if apart_mm is not None:
         doubts.append(Reason(ReasonCode.POSE_AMBIGUOUS, {"apart_mm": apart_mm}))
     modes = posterior.n_modes
-    z2, limit = posterior.mean_square_z, max(_IMPLAUSIBLE, float(chi2.isf(_RARE, modes)) / modes)
+    z2, limit = posterior.mean_square_z, max(_IMPLAUSIBLE, float(chdtri(modes, _RARE)) / modes)
     if z2 > limit:
         doubts.append(Reason(ReasonCode.SHAPE_IMPLAUSIBLE, {"z_rms": float(np.sqrt(z2))}))
     if calibration is not None:

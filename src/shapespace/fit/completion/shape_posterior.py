@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
-from scipy.stats import chi2, f
+from scipy.special import fdtri, gammaincinv
 
 from shapespace.errors import FitError
 from shapespace.fit.dense.residual_modes import ResidualModes, residual_modes
@@ -237,7 +237,7 @@ def _mismatches_mm(surface: Mesh, points: FloatArray, far_mm: float) -> tuple[fl
     matches = build_engine(surface).query(points)  # the walks of the fit may end in another fold of the surface
     squared = np.minimum(matches.distance, far_mm) ** 2
     covered = ~on_boundary(matches, surface, boundary_vertices(surface))
-    robust = np.sqrt(np.quantile(squared[covered], 0.9) / chi2.ppf(0.9, 1)) if covered.any() else np.inf
+    robust = np.sqrt(np.quantile(squared[covered], 0.9) / (2 * gammaincinv(0.5, 0.9))) if covered.any() else np.inf
     return float(np.sqrt(squared.mean())), float(robust)
 
 
@@ -391,7 +391,7 @@ class LeftOutErrors:
         """Return the covariance (P, P) of the predictive distribution of the error (E4)."""
         n = len(self.errors)
         # Hotelling's T^2 of one of n errors, so that 95 % regions of a vertex contain it with a probability of 95 %.
-        factor = 3 * n / (n - 2) * float(f.ppf(_COVERED, 3, n - 2) / chi2.ppf(_COVERED, 3))
+        factor = 3 * n / (n - 2) * float(fdtri(3, n - 2, _COVERED) / (2 * gammaincinv(1.5, _COVERED)))
         return self.errors.T @ self.errors * (factor / n) + self.noise
 
 

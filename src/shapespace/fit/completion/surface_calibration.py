@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from shapespace.errors import FitError
 from shapespace.fit.completion.shape_posterior import ShapePosterior, root_of, shape_posterior
@@ -83,7 +83,7 @@ class SurfaceCalibration:
         """Whether missing vertices are predicted better than by the mean shape (t test over the shapes)."""
         ratios = self.log_ratios
         n = len(ratios)
-        limit = float(student.ppf(1.0 - _SIGNIFICANT, n - 1)) * float(ratios.std(ddof=1)) / np.sqrt(n)
+        limit = float(stdtrit(n - 1, 1.0 - _SIGNIFICANT)) * float(ratios.std(ddof=1)) / np.sqrt(n)
         return float(ratios.mean()) > limit
 
     def interval(
@@ -105,7 +105,7 @@ class SurfaceCalibration:
         spread = float(np.sqrt((off**2).mean() * (1.0 + 1.0 / n)))
         k = int(np.floor((1.0 - level) * (n + 1)))
         if k < 1:
-            reach = float(student.ppf(0.5 + level / 2, n - 1)) * spread  # E12
+            reach = float(stdtrit(n - 1, 0.5 + level / 2)) * spread  # E12
             return value - float(off.mean()), spread, value - reach, value + reach
         low, high = np.sort(others - np.abs(off)), np.sort(others + np.abs(off))
         return value - float(off.mean()), spread, float(low[k - 1]), float(high[n - k])  # E11

@@ -11,8 +11,8 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from scipy import stats
 from scipy.spatial import ConvexHull, QhullError
+from scipy.special import fdtri
 
 from shapespace.cohort.orientation import current_orientation, view_rotation
 from shapespace.errors import InputError, ShapespaceError
@@ -333,7 +333,7 @@ class Morphospace:
         codes = self.arrays["groups"].astype(np.intp)
         counts = np.bincount(codes, minlength=max(len(self.part.groups), 1)).astype(np.float64)
         return np.where(
-            counts >= _FEWEST_OF_ELLIPSE, np.sqrt(2 * stats.f.ppf(_ELLIPSE, 2, np.maximum(counts - 1, 1))), np.nan
+            counts >= _FEWEST_OF_ELLIPSE, np.sqrt(2 * fdtri(2, np.maximum(counts - 1, 1), _ELLIPSE)), np.nan
         )
 
 

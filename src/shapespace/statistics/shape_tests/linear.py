@@ -458,14 +458,14 @@ def _repeatabilities(y: FloatArray, subjects: Orders, sessions: Orders) -> dict[
 
 def _jackknife(name: str, value: tuple[float, float], left_out: Sequence[tuple[float, float]]) -> Statistic:
     """Return an intraclass correlation with the jackknife interval of its Fisher transform."""
-    from scipy.stats import t  # loads much
+    from scipy.special import stdtrit  # loads much
 
     def transform(r: float, k: float) -> float:
         return 0.5 * float(np.log(max(1 + (k - 1) * r, 1e-12) / max(1 - r, 1e-12)))
 
     s, center = len(left_out), transform(*value)
     each = np.array([transform(*estimate) for estimate in left_out])
-    width = float(t.ppf(1 - LEVEL / 2, s - 1) * np.sqrt((s - 1) / s * ((each - each.mean()) ** 2).sum()))
+    width = float(stdtrit(s - 1, 1 - LEVEL / 2) * np.sqrt((s - 1) / s * ((each - each.mean()) ** 2).sum()))
     low, high = (
         (ratio - 1) / (ratio + value[1] - 1) for ratio in np.exp(2 * np.array([center - width, center + width]))
     )

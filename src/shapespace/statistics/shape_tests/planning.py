@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import binomtest, norm
+from scipy.special import ndtri
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.errors import InputError
@@ -65,6 +65,8 @@ def plan_sample_size(
         >>> plan.name
         'power'
     """
+    from scipy.stats import binomtest  # loads much
+
     if not sizes or min(sizes) < 2 or simulations < 1 or permutations < 1 / LEVEL:
         raise InputError("Planning needs sizes of 2 or more, 1 or more simulations and 20 or more permutations.")
     cohort, groups = groups_of(cohort, group, drop_missing, 3, "planning")
@@ -171,5 +173,5 @@ def _smallest_size(sizes: tuple[float, ...], powers: tuple[float, ...]) -> int |
     if not powers[0] < _POWER <= max(powers):
         return None
     # The probit of the power is nearly linear in the root of the size.
-    probits = norm.ppf(np.clip(np.maximum.accumulate(powers), 1e-3, 1 - 1e-3))
-    return math.ceil(float(np.interp(float(norm.ppf(_POWER)), probits, np.sqrt(sizes))) ** 2)
+    probits = ndtri(np.clip(np.maximum.accumulate(powers), 1e-3, 1 - 1e-3))
+    return math.ceil(float(np.interp(float(ndtri(_POWER)), probits, np.sqrt(sizes))) ** 2)

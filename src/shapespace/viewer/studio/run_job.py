@@ -14,6 +14,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -24,8 +25,6 @@ from shapespace.io.files import write_text
 
 JOB, LOG, EXIT, CANCEL, LOCK, PROGRESS = "job.json", "log.txt", "exit.json", "cancel", "lock", "progress.json"
 _NEW_GROUP = 0x200 if sys.platform == "win32" else 0  # CREATE_NEW_PROCESS_GROUP
-_started: list[subprocess.Popen[bytes]] = []
-"""Processes of this server; it asks for their end, as otherwise they stay in the list of the system."""
 PARTLY = 1  # exit code of commands of which some scans failed
 _POLL_S, _PATIENCE_S = 0.1, 20.0  # between looks at the files; after an interruption until the command is killed
 
@@ -49,13 +48,13 @@ def start(folder: Path) -> None:
     Raises:
         OSError: it cannot be started.
     """
-    _started[:] = [process for process in _started if process.poll() is None]
     process = subprocess.Popen(
         [sys.executable, "-m", "shapespace.viewer.studio.run_job", str(folder)],
         stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=folder,
         start_new_session=True, creationflags=_NEW_GROUP,
     )  # fmt: skip
-    _started.append(process)
+    # Without a wait it would stay in the list of the system after its end.
+    threading.Thread(target=process.wait, name="end of a job", daemon=True).start()
 
 
 def main(folder: Path) -> int:
