@@ -9,7 +9,7 @@ from test_studio_in_browser import WINDOW, User, barriers, has_drawn, studio, wr
 
 from shapespace.io.meshes.mesh_io import read_mesh
 
-COUNT = 4
+COUNT = 6
 MARKS = ("left tip", "right tip", "left side", "right side", "left end", "right end")
 
 
@@ -71,7 +71,7 @@ def test_a_question_about_landmarks_and_a_curve_on_scans(open_tab, tmp_path: Pat
         assert barriers(tab) == []
         tab.page.get_by_test_id("landmarks-close").click()
         # The question, with one specimen that lacks a landmark.
-        open_scan(tab, "bone_003")
+        open_scan(tab, "bone_005")
         tab.page.get_by_test_id("mark-left tip").click()
         tab.page.get_by_test_id("mark-remove").click()
         close_scan(tab)
@@ -79,11 +79,11 @@ def test_a_question_about_landmarks_and_a_curve_on_scans(open_tab, tmp_path: Pat
         user.click("question-compare")
         assert "Landmarks on the scans" in tab.page.get_by_test_id("of-placed").inner_text()
         user.click("term-group")
-        tab.until("document.querySelector('[data-testid=checks]').innerText.includes('bone_003 1 of 11')")
+        tab.until("document.querySelector('[data-testid=checks]').innerText.includes('bone_005 1 of 11')")
         tab.shot("question-form")
         assert barriers(tab) == []
         tab.page.get_by_test_id("optionmissing-landmarks").select_option("estimate-by-spline")
-        tab.until("document.querySelector('[data-testid=checks]').innerText.includes('Included specimens: 4')")
+        tab.until("document.querySelector('[data-testid=checks]').innerText.includes('Included specimens: 6')")
         user.click("run-compare")
         user.has_run(1)
         user.sees("sentences")
@@ -93,7 +93,7 @@ def test_a_question_about_landmarks_and_a_curve_on_scans(open_tab, tmp_path: Pat
         assert "align inputs/0001-landmarks/landmarks.csv" in command and "--missing=tps" in command
         # After an edit of a landmark the answer is marked.
         tab.page.get_by_test_id("tab-specimens").click()
-        open_scan(tab, "bone_002")
+        open_scan(tab, "bone_004")
         tab.page.get_by_test_id("mark-left tip").click()
         tab.page.get_by_test_id("mark-z").press("ArrowUp")
         close_scan(tab)
