@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import TypeAlias
 
 Progress: TypeAlias = Callable[[int, int], None]
@@ -29,3 +30,12 @@ class StepCounter:
         self.done += count
         if self.progress is not None:
             self.progress(self.done, self.total)
+
+
+def progress_of_run(progress: Progress | None, run: int, runs: int) -> Progress | None:
+    """Return the progress function of one of several runs of equal length, counted from 0; None without progress."""
+    return None if progress is None else partial(_report_run, progress, run, runs)
+
+
+def _report_run(progress: Progress, run: int, runs: int, done: int, total: int) -> None:
+    progress(run * total + done, runs * total)
