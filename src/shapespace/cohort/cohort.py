@@ -229,6 +229,10 @@ class Cohort:
         """Joints of the parts, in their mean shapes and relative poses; for a cohort with `parts`."""
         return Articulation(self.reference, tuple(self.parts.values()))
 
+    def part_shapes(self, row: int) -> FloatArray:
+        """Return the vertices (V, 3), mm, of the parts of a shape, each in the pose of its mean."""
+        return self.reference + self.articulation.from_tangent(self.vertices(row)).shape
+
     @cached_property
     def dimensions(self) -> Literal[2, 3]:
         """Dimensions of the coordinates: 2 if z is the same everywhere, as of planar landmarks."""
@@ -614,8 +618,18 @@ class Cohort:
                 f"The size of {list_names(without_size)} is not known in mm, so forms cannot be compared; fit with "
                 "--unit, or compare shapes with --set gauge=shape."
             )
-        if gauge == "form" or model.gauge == "form":
-            centre = reference.mean(axis=0)
+        centre, parts = reference.mean(axis=0), parts_of_model(model)
+        if parts:
+            surfaces, counts = [model.reconstruct(row) for row in b], tuple(parts.values())
+            if gauge == "form":
+                scales = sizes_mm / [centroid_size(x) for x in surfaces]
+                reference = centre + float(scales.mean()) * (reference - centre)
+            else:
+                scales = size_of_parts(reference, counts) / np.array([size_of_parts(x, counts) for x in surfaces])
+            articulation = Articulation(reference, counts)
+            shapes = np.stack([articulation.encode(s * x) for s, x in zip(scales, surfaces, strict=True)])
+            rows, b = (shapes - reference).reshape(len(shapes), -1), np.eye(len(shapes))
+        elif gauge == "form" or model.gauge == "form":
             middle = (reference - centre).ravel()
             if gauge == "form":
                 scales = sizes_mm / np.array([centroid_size(reference + (row @ rows).reshape(-1, 3)) for row in b])
@@ -639,7 +653,7 @@ class Cohort:
             landmarks=model.landmarks,
             fitted=fitted,
             source=fitted.source("coefficients"),
-            parts=parts_of_model(model),
+            parts=parts,
         )
         check_distinct(cohort)
         return cohort
@@ -670,9 +684,10 @@ def _align_to(shapes: FloatArray, onto: Cohort) -> None:
     """
     if onto.parts:
         counts = onto.articulation.counts
+        common = np.mean([size_of_parts(onto.part_shapes(row), counts) for row in range(len(onto))])
         for k, shape in enumerate(shapes):
-            scale = size_of_parts(onto.reference, counts) / size_of_parts(shape, counts)
-            shapes[k] = onto.articulation.encode(scale * shape if onto.gauge == "shape" else shape)
+            scale = common / size_of_parts(shape, counts) if onto.gauge == "shape" else 1.0
+            shapes[k] = onto.articulation.encode(scale * shape)
         return
     mean_shape = onto.vertices(onto.coefficients.mean(axis=0))
     part = slice(None) if onto.analysed is None else onto.analysed

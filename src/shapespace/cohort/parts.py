@@ -59,7 +59,7 @@ def cohort_of_part(cohort: Cohort, name: str) -> Cohort:
         raise InputError(f"There is no part {name[:40]!r}; choose one of {', '.join(cohort.parts)}.")
     part = cohort.articulation.slices[list(cohort.parts).index(name)]
     rows, note = _rows_with(cohort, [name])
-    shapes = cohort.articulation.template + np.stack([_poses(cohort, row).shape for row in rows])
+    shapes = np.stack([cohort.part_shapes(row) for row in rows])
     larger = cohort.sizes_mm[rows] / [size_of_parts(shape, cohort.articulation.counts) for shape in shapes]
     seen = np.ones((len(rows), cohort.n_vertices), dtype=np.bool_)
     seen = seen if cohort.observed is None else cohort.observed[rows]

@@ -56,7 +56,7 @@ def pose_means(result: CompareResult) -> Iterator[PoseMean]:
             rows = np.flatnonzero(np.array(cells) == group)
             codes = np.unique(owners[rows], return_inverse=True)[1]
             for joint, values in zip(poses.joints, poses.numbers[rows].transpose(1, 0, 2), strict=True):
-                mean, half, stddev = _mean_with_interval(means_of(values, codes))
+                mean, half, stddev = mean_with_interval(means_of(values, codes))
                 name = f"{variable} {group}".strip()
                 yield PoseMean(name, joint, int(codes.max()) + 1, mean, mean - half, mean + half, stddev)
 
@@ -72,7 +72,7 @@ def pose_changes(result: CompareResult) -> dict[str, FloatArray]:
     return dict(zip((effect.label for effect in own.effects), numbers[1::2] - numbers[::2], strict=True))
 
 
-def _mean_with_interval(values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def mean_with_interval(values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the mean (6,) of values (n, 6), the half width of its interval, and the standard deviation."""
     from scipy.special import stdtrit  # loads much
 
