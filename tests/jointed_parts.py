@@ -70,7 +70,7 @@ def write_knees(folder: Path, subjects: Sequence[Mesh], parts: dict[str, int] = 
         write_text(folder / f"{mesh.name}{CorrespondRecord.ENDING}", json_text(record))
     names = [mesh.name for mesh in subjects]
     summary = CorrespondenceRecord(
-        template="s00 is the first template.", vertices=sum(parts.values()), rounds=[0.0], corresponding=names,
+        template="s00 is the first template.", vertices=len(subjects[0].vertices), rounds=[0.0], corresponding=names,
         set_aside={}, settings={"rounds": 1, "settled": 0.002}, version="0.1.0", parts=parts,
     )  # fmt: skip
     write_text(folder / CorrespondenceRecord.FILE, json_text(summary))

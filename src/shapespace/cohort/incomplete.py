@@ -117,13 +117,14 @@ def completed_parts(
     present, start = np.zeros_like(observed), 0
     for part, count in parts.items():
         own = slice(start, start + count)
-        rows = np.flatnonzero(observed[:, own].mean(axis=1) >= MIN_SEEN)
+        rows: list[int] = np.flatnonzero(observed[:, own].mean(axis=1) >= MIN_SEEN).tolist()
         if len(rows) < max(MIN_SEEN * len(shapes), _FEWEST_SHAPES):
             raise InputError(
                 f"The part {part} is missing in {len(shapes) - len(rows)} of {len(shapes)} shapes, which is more than "
                 "half; exclude the part, or give more shapes that have it."
             )
-        present[rows, own], start = True, start + count
+        present[rows, own] = True
+        start += count
         if observed[rows, own].all():
             continue
         part_names = [names[row] for row in rows]

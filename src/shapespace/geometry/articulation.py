@@ -279,6 +279,7 @@ def articulate(
         larger /= larger.mean()
         shapes = align_shapes(shapes / larger[:, None, None], "form")
     template = shapes.mean(axis=0)
+    articulation, poses = Articulation(template, counts), list[PartPoses]()
     for _ in range(_ROUNDS):
         articulation = Articulation(template, counts)
         poses = [articulation.poses_of(shape) for shape in shapes]

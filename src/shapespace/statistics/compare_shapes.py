@@ -388,9 +388,9 @@ def compare(
     The formula may contain the columns of the table and also `size` and `log_size`, the centroid size in mm and its
     logarithm.
 
-    Objects of several parts are compared as a whole, by the shapes of their parts and the relative poses together, and
-    then each part and the relative poses. Shapes that lack a part are excluded from the tests of this part and of the
-    relative poses.
+    Objects of several parts are compared by the shapes of their parts and the relative poses together, and then by
+    each part and by the relative poses alone. Shapes that lack a part are excluded from the tests of this part and of
+    the relative poses; in the comparison of all together the part is estimated.
 
     If completed shapes have samples, each imputation is tested too, and p values combine them by Rubin's rules.
 

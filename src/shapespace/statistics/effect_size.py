@@ -60,7 +60,7 @@ def permutation_p(statistic: FloatArray, tail: Literal["upper", "lower"] = "uppe
 
 
 def holm_p(p: Sequence[float]) -> tuple[float, ...]:
-    """Return p values corrected over their family by the step-down method of Holm (1979), which holds for any tests."""
+    """Return p values corrected over their family by Holm (1979), whatever the dependence of the tests."""
     order = np.argsort(p, kind="stable")
     corrected = np.maximum.accumulate(np.minimum(np.asarray(p)[order] * np.arange(len(p), 0, -1), 1.0))
     return tuple(corrected[np.argsort(order)].tolist())

@@ -246,10 +246,10 @@ def surface_files(paths: Sequence[Path], *, recursive: bool = False) -> SurfaceF
     if len({tuple(own.items()) for own in parts.values()}) > 1:
         stated = "; ".join(f"{folder}: {', '.join(own) or 'none'}" for folder, own in parts.items())
         raise InputError(f"The folders have different parts ({stated}); give surfaces of the same parts.")
+    shared = next(iter(parts.values()), dict[str, int]())
     return SurfaceFiles(
-        tuple(files), ratios, frozenset(mirrored), frozenset(doubtful), tuple(notes), needs_review,
-        next(iter(parts.values()), {}),
-    )  # fmt: skip
+        tuple(files), ratios, frozenset(mirrored), frozenset(doubtful), tuple(notes), needs_review, shared
+    )
 
 
 def reviewed_surfaces(
