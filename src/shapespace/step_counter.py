@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import TypeAlias
 
 Progress: TypeAlias = Callable[[int, int], None]
@@ -34,8 +33,4 @@ class StepCounter:
 
 def progress_of_run(progress: Progress | None, run: int, runs: int) -> Progress | None:
     """Return the progress function of one of several runs of equal length, counted from 0; None without progress."""
-    return None if progress is None else partial(_report_run, progress, run, runs)
-
-
-def _report_run(progress: Progress, run: int, runs: int, done: int, total: int) -> None:
-    progress(run * total + done, runs * total)
+    return None if progress is None else lambda done, total: progress(run * total + done, runs * total)

@@ -20,7 +20,7 @@ def p_values(studies: int, **effect: float) -> FloatArray:
     for study in range(studies):
         subjects = knees(SUBJECTS, 1000 + study, parts=PARTS, **effect)
         columns = {"sex": sexes(SUBJECTS)}
-        cohort = Cohort.of_shapes([mesh.vertices for mesh in subjects], columns, gauge="form", parts=PARTS)
+        cohort = Cohort.of_shapes(np.stack([mesh.vertices for mesh in subjects]), columns, gauge="form", parts=PARTS)
         result = compare(cohort, "~ sex", CompareConfig(permutations=200, maps=False, seed=study))
         p = [test.test.p for test in result.part_tests]
         found.append([result.tests[0].p, *p, min(test.p_family for test in result.part_tests)])

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.table import list_names
 from shapespace.errors import InputError
-from shapespace.geometry.articulation import PartPoses, size_of_parts
+from shapespace.geometry.articulation import size_of_parts
 from shapespace.geometry.procrustes import centroid_size
 from shapespace.model.missing import MIN_SEEN
 from shapespace.reprs import short_repr
@@ -61,8 +61,7 @@ def cohort_of_part(cohort: Cohort, name: str) -> Cohort:
     rows, note = _rows_with(cohort, [name])
     shapes = np.stack([cohort.part_shapes(row) for row in rows])
     larger = cohort.sizes_mm[rows] / [size_of_parts(shape, cohort.articulation.counts) for shape in shapes]
-    seen = np.ones((len(rows), cohort.n_vertices), dtype=np.bool_)
-    seen = seen if cohort.observed is None else cohort.observed[rows]
+    observed = None if cohort.observed is None else cohort.observed[rows][:, part]
     faces, inside = cohort.faces, np.zeros(cohort.n_vertices, dtype=np.bool_)
     inside[part] = True
     own = Cohort.of_shapes(
@@ -73,7 +72,7 @@ def cohort_of_part(cohort: Cohort, name: str) -> Cohort:
         gauge=cohort.gauge,
         landmarks=None if cohort.landmarks is None else cohort.landmarks.renumbered(inside),
         unit=cohort.unit,
-        observed=seen[:, part] if cohort.analysed is None else seen[:, part] & cohort.analysed[part],
+        observed=observed,
     )
     return replace(
         own,
@@ -99,9 +98,8 @@ def cohort_of_poses(cohort: Cohort) -> Cohort:
     require_parts(cohort, "A relative pose")
     articulation = cohort.articulation
     rows, note = _rows_with(cohort, list(cohort.parts))
-    off = np.stack([
-        articulation.to_tangent(replace(_poses(cohort, row), shape=np.zeros_like(cohort.reference))) for row in rows
-    ]) - cohort.reference  # fmt: skip
+    poses = [articulation.from_tangent(cohort.vertices(row)) for row in rows]
+    off = np.stack([articulation.to_tangent(replace(own, shape=0 * own.shape)) for own in poses]) - cohort.reference
     u, s, vt = np.linalg.svd(off.reshape(len(rows), -1), full_matrices=False)
     rank = 6 * len(articulation.joints)  # three rotations and three translations per joint
     return replace(
@@ -127,20 +125,13 @@ def without_relative_pose(cohort: Cohort) -> Cohort:
         cohort: shapes of several parts.
     """
     rows, note = _rows_with(cohort, list(cohort.parts))
-    parts = [cohort_of_part(cohort.take(rows), name) for name in cohort.parts]
-    basis = np.zeros((sum(len(own.basis) for own in parts), cohort.reference.size))
-    start = 0
-    for own, part in zip(parts, cohort.articulation.slices, strict=True):
-        basis[start : start + len(own.basis), 3 * part.start : 3 * part.stop] = own.basis
-        start += len(own.basis)
-    masks = [own.analysed for own in parts]
-    analysed = [np.ones(own.n_vertices, np.bool_) if own.analysed is None else own.analysed for own in parts]
+    cohort = cohort.take(rows, *note)
+    parts = [cohort_of_part(cohort, name) for name in cohort.parts]
     return replace(
-        cohort.take(rows, *note),
+        cohort,
         reference=read_only(np.concatenate([own.reference for own in parts])),
-        basis=read_only(basis),
+        basis=read_only(block_diag(*(own.basis for own in parts))),
         coefficients=read_only(np.hstack([own.coefficients for own in parts])),
-        analysed=None if all(mask is None for mask in masks) else np.concatenate(analysed),
         samples=(),
     )
 
@@ -209,21 +200,13 @@ def relative_poses(
     )
 
 
-def _poses(cohort: Cohort, row: int) -> PartPoses:
-    return cohort.articulation.from_tangent(cohort.vertices(row))
-
-
 def _rows_with(cohort: Cohort, names: Sequence[str]) -> tuple[list[int], tuple[str, ...]]:
     """Return the rows of the shapes that show `MIN_SEEN` or more of each of these parts, and a note on the others."""
-    if cohort.observed is None:
-        return list(range(len(cohort))), ()
     has = np.ones(len(cohort), dtype=np.bool_)
-    known = cohort.observed if cohort.analysed is None else cohort.observed[:, cohort.analysed]
-    ends = np.cumsum([0, *cohort.parts.values()]).tolist()
-    place = np.arange(cohort.n_vertices) if cohort.analysed is None else np.flatnonzero(cohort.analysed)
-    for name, (start, end) in zip(cohort.parts, pairwise(ends), strict=True):
-        if name in names:
-            has &= known[:, (place >= start) & (place < end)].mean(axis=1) >= MIN_SEEN
+    for name, part in zip(cohort.parts, cohort.articulation.slices, strict=True):
+        if cohort.observed is not None and name in names:
+            known = slice(None) if cohort.analysed is None else cohort.analysed[part]
+            has &= cohort.observed[:, part][:, known].mean(axis=1) >= MIN_SEEN
     lack = [name for name, own in zip(cohort.names, has, strict=True) if not own]
     note = f"{len(lack)} of {len(cohort)} shapes lack {' or '.join(names)} and are excluded ({list_names(lack)})."
     return np.flatnonzero(has).tolist(), (note,) if lack else ()

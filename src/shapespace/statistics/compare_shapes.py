@@ -425,10 +425,9 @@ def compare(
             compared[name] = _compare_shapes(own, formula, options, progress=progress_of_run(progress, run, runs))
         except InputError as error:
             raise InputError(f"The comparison of {name}: {error}") from error
-    if not compared:
-        return result
-    family = (*result.methods.corrected_over, "the parts and their relative pose (p of all parts, Holm 1979)")
-    return replace(result, parts=compared, methods=structs.replace(result.methods, corrected_over=family))
+    family = ("the parts and their relative pose (p of all parts, Holm 1979)",) if compared else ()
+    methods = structs.replace(result.methods, corrected_over=(*result.methods.corrected_over, *family))
+    return replace(result, parts=compared, methods=methods)
 
 
 @over_imputations(
