@@ -28,6 +28,8 @@ def knees(
 ) -> list[Mesh]:
     """Return knees whose shapes, sizes, and flexion vary; those of odd numbers differ by `bend` and `widen`.
 
+    Vertices have noise of 0.05 mm.
+
     Args:
         count: number of subjects.
         seed: of the subjects.
@@ -44,6 +46,7 @@ def knees(
         odd, a, b, c = number % 2, *(0.1 * rng.normal(size=3))
         femur = x * [1.0, 1.0 + a, 1.0] + [0.0, 0.0, 1.0] * (2e-3 * b * x[:, :1] ** 2)
         tibia = y * [1.0, 1.0 + c, 1.0 + odd * widen] + [47.0, 0.0, 0.0]
+        femur, tibia = (part + 0.05 * rng.normal(size=part.shape) for part in (femur, tibia))
         angle = np.deg2rad(rng.uniform(0.0, degrees) + odd * bend)
         tibia = tibia @ Rotation.from_rotvec(angle * np.array(FLEXION)).as_matrix().T + rng.normal(size=3)
         whole = (1.0 + 0.03 * rng.normal()) * np.concatenate([femur - [50.0, 0.0, 0.0], tibia])

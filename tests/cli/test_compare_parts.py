@@ -77,8 +77,9 @@ def test_impossible_options_have_one_sentence(run: Run, tmp_path: Path) -> None:
     one = write_knees(tmp_path / "one", knees(8, seed=4), {})
     told = run("compare", one, "~ sex", "--pose-axes", "0,1,2", "--shapes", tmp_path / "one", "-o", tmp_path / "answer")
     assert told.code != 0 and "needs shapes of several parts" in told.sentence()
-    told = run("test", "integration", one, "--shapes", tmp_path / "one", "-o", tmp_path / "answer")
-    assert told.code != 0 and "needs shapes of several parts" in told.sentence()
+    for test, words in (("integration", "or shapes of several parts"), ("modularity", "needs shapes of several parts")):
+        told = run("test", test, one, "--shapes", tmp_path / "one", "-o", tmp_path / "answer")
+        assert told.code != 0 and words in told.sentence()
     other = write_knees(tmp_path / "other", knees(8, seed=4), {"femur": 80, "foot": 50})
     told = run("compare", other, "~ sex", "--shapes", tmp_path / "other", "-o", tmp_path / "answer")
     assert told.code != 0 and "have 130 vertices" in told.sentence()

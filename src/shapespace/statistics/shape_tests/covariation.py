@@ -70,8 +70,11 @@ def fit_pls(
         >>> 0 < result.statistics[0].p <= 1
         True
     """
-    if columns and modules is not None:
-        raise InputError("Partial least squares needs either --columns of the table as the first block, or --modules.")
+    if bool(columns) == (modules is not None) and (columns or not cohort.parts):
+        raise InputError(
+            "Partial least squares needs either --columns of the table as the first block, or --modules or shapes of "
+            "several parts."
+        )
     cohort = cohort.complete(columns, drop_missing=drop_missing, numbers=columns)
     if columns:
         given = np.column_stack([cohort.table.numbers(column) for column in columns])
