@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from msgspec import structs
 
 from shapespace.cohort.cohort import Cohort
 from shapespace.cohort.parts import RELATIVE_POSE
@@ -48,6 +47,7 @@ _BINS = 40  # bins of a histogram of thousands of permutations
 _FEWEST_ARRANGEMENTS = 20
 """Number of different arrangements below which no p value can be small."""
 _PALE = "Vertices that are not found to differ are pale."
+_POSE_DECIMALS = 3  # of degrees and mm in tables of relative poses, below what surfaces show
 _NO_FACES = np.zeros((0, 3), dtype=np.int32)
 
 
@@ -142,7 +142,7 @@ def _effects_of_all(result: CompareResult) -> Iterator[tuple[str, CompareResult,
 def _term_sentences(result: CompareResult, part: str = "", family: Mapping[str, float] | None = None) -> Iterator[str]:
     """Yield a sentence on each term; `family` are p values over all parts."""
     kind = {"box-cox": "Box-Cox", "log": "log F"}[result.config.effect_size]
-    subject = "shape and relative pose together" if result.parts else part or "shape"
+    subject = "shape including relative pose" if result.parts else part or "shape"
     subject = f"the shape of {part}" if part in result.cohort.parts or (part and part != RELATIVE_POSE) else subject
     for test in result.tests:
         p = test.p if family is None else family[test.term]
@@ -192,8 +192,11 @@ def _part_tables(result: CompareResult) -> Iterator[ResultTable]:
         file="parts.csv",
     )  # fmt: skip
     angle = [Column(f"rotation {k}, degrees", "number", f"rotation_{k}_degrees") for k in (1, 2, 3)]
-    numbers = (*angle, *(lengths.column(f"translation {k}", f"translation_{k}") for k in (1, 2, 3)))
-    poses, means = poses_of(result), list(pose_means(result))
+    numbers = (
+        *angle,
+        *(Column(lengths.label(f"translation {k}"), "number", lengths.field(f"translation_{k}")) for k in (1, 2, 3)),
+    )
+    poses = poses_of(result)
     axes = (
         f"Axis 1 points from {result.config.pose_axes[0]} to {result.config.pose_axes[1]}, axis 2 towards "
         f"{result.config.pose_axes[2]}, axis 3 is perpendicular to both"
@@ -202,16 +205,19 @@ def _part_tables(result: CompareResult) -> Iterator[ResultTable]:
     )
     yield ResultTable(
         title="Mean relative pose",
-        note=f"Relative to the mean of all shapes: components of the rotation vector, and displacements at the joint, "
-        f"with standard deviations between subjects; 95 % intervals are in pose_means.csv. {axes}.",
+        note="Relative to the mean of all shapes: components of the rotation vector, and displacements at the joint, "
+        f"with 95 % intervals of the mean and standard deviations between subjects. {axes}.",
         columns=(
             Column("shapes", field="group"), Column("joint", field="joint"), Column("subjects", "count", "subjects"),
-            *numbers, *(structs.replace(column, name=f"SD of {column.name}", field=f"sd_{column.field}")
-                        for column in numbers),
-            *(structs.replace(column, name="", field=f"{end}_{column.field}") for end in ("low", "high")
-              for column in numbers),
+            Column("component", field="component"), *(Column(name, "number", name) for name in ("mean", "low", "high")),
+            Column("standard deviation", "number", "stddev"),
         ),
-        rows=[(own.group, own.joint, own.subjects, *own.mean, *own.stddev, *own.low, *own.high) for own in means],
+        rows=[
+            (own.group, own.joint, own.subjects, column.name, *values)
+            for own in pose_means(result)
+            for column, *values in zip(numbers, *(np.round(v, _POSE_DECIMALS) + 0.0 for v in
+                                                  (own.mean, own.low, own.high, own.stddev)), strict=True)
+        ],
         file="pose_means.csv",
     )  # fmt: skip
     yield ResultTable(
@@ -219,7 +225,7 @@ def _part_tables(result: CompareResult) -> Iterator[ResultTable]:
         note=f"Change of least-squares means from low to high. {axes}.",
         columns=(Column("from, to", field="change"), Column("joint", field="joint"), *numbers),
         rows=[
-            (label, joint, *values)
+            (label, joint, *(np.round(values, _POSE_DECIMALS) + 0.0))
             for label, change in pose_changes(result).items()
             for joint, values in zip(poses.joints, change, strict=True)
         ],
