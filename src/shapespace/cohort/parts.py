@@ -37,8 +37,8 @@ def require_parts(cohort: Cohort, why: str) -> None:
     """
     if not cohort.parts:
         raise InputError(
-            f"{why} needs shapes of several parts, and these have one; give the folder of a correspondence of parts "
-            "(correspond --parts)."
+            f"{why} needs shapes of several parts, and these have one; give surfaces of several parts in "
+            "correspondence."
         )
 
 
