@@ -29,3 +29,8 @@ class StepCounter:
         self.done += count
         if self.progress is not None:
             self.progress(self.done, self.total)
+
+
+def progress_of_run(progress: Progress | None, run: int, runs: int) -> Progress | None:
+    """Return the progress function of one of several runs of equal length, counted from 0; None without progress."""
+    return None if progress is None else lambda done, total: progress(run * total + done, runs * total)

@@ -913,6 +913,7 @@ COMMANDS: tuple[CommandSpec, ...] = (
             advanced("--level", "P", source=COMPARE, field="alpha"),
             advanced("--variances", source=COMPARE),
             advanced("--bumps", "MM", source=COMPARE, field="bump_width_mm"),
+            advanced("--pose-axes", "A,B,C", source=COMPARE),
         ),
         settings=_question_settings(
             setting("error_permutation", source=COMPARE),

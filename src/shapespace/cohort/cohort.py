@@ -14,10 +14,11 @@ from typing import Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from shapespace.cohort.incomplete import complete_by_population, completed_shapes
+from shapespace.cohort.incomplete import complete_by_population, completed_parts, completed_shapes
 from shapespace.cohort.shape_samples import ShapeSamples
 from shapespace.cohort.table import Table, cell_text, class_notes, list_names, numbers_as_text
 from shapespace.errors import InputError
+from shapespace.geometry.articulation import Articulation, articulate, size_of_parts
 from shapespace.geometry.landmark_alignment import AlignedLandmarks, project_to_tangent
 from shapespace.geometry.procrustes import Gauge, align_in_place, centroid_size, scale_to_tangent
 from shapespace.geometry.similarity import fit_similarity
@@ -126,6 +127,9 @@ class FitDiagnostics:
 class Cohort:
     """N shapes in correspondence; shape i has the vertices reference + coefficients[i] basis, in one frame.
 
+    Vertices of several parts are tangent vertices: the shapes of the parts and their relative poses, to first order
+    (docs/structures.md, S5). `mesh` returns them with exact rotations.
+
     Args:
         names: names of the shapes.
         reference: (V, 3) vertices from which coefficients are counted, mm; not the mean of these shapes.
@@ -152,6 +156,8 @@ class Cohort:
         samples: N samples of the distribution of each completed shape, in any pose; None for shapes without. Empty if
             no shape has any.
         review: number of the surfaces read from a correspondence that need review.
+        parts: name -> number of vertices of each part of the objects, in the order of the vertices; empty for objects
+            of one part.
     """
 
     names: tuple[str, ...]
@@ -175,6 +181,7 @@ class Cohort:
     cautions: tuple[str, ...] = ()
     drop_missing: bool = False
     orientation: Orientation | None = None
+    parts: Mapping[str, int] = field(default_factory=dict[str, int])
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -216,6 +223,15 @@ class Cohort:
     def n_vertices(self) -> int:
         """Number of vertices, V."""
         return len(self.reference)
+
+    @cached_property
+    def articulation(self) -> Articulation:
+        """Joints of the parts, in their mean shapes and relative poses; for a cohort with `parts`."""
+        return Articulation(self.reference, tuple(self.parts.values()))
+
+    def part_shapes(self, row: int) -> FloatArray:
+        """Return the vertices (V, 3), mm, of the parts of a shape, each in the pose of its mean."""
+        return self.reference + self.articulation.from_tangent(self.vertices(row)).shape
 
     @cached_property
     def dimensions(self) -> Literal[2, 3]:
@@ -262,14 +278,17 @@ class Cohort:
         drawn = np.stack([np.asarray(own[k], dtype=np.float64) for own in self.samples if own is not None])
         shapes, sizes = np.stack([self.vertices(row) for row in range(len(self))]), self.sizes_mm.copy()
         part = slice(None) if self.analysed is None else self.analysed
-        sizes[rows] = [centroid_size(sample[part]) for sample in drawn]
+        sizes[rows] = [
+            size_of_parts(sample, tuple(self.parts.values())) if self.parts else centroid_size(sample[part])
+            for sample in drawn
+        ]
         _align_to(drawn, onto or self)
         shapes[rows] = drawn
         observed = None if self.observed is None else self.observed.copy()
         if observed is not None:
             observed[rows] = True if self.analysed is None else self.analysed
             observed = None if observed.all() else observed
-        reference = shapes.mean(axis=0)
+        reference = self.reference if self.parts else shapes.mean(axis=0)
         basis, coefficients = _orthonormal((shapes - reference).reshape(len(shapes), -1))
         return replace(
             self,
@@ -297,10 +316,15 @@ class Cohort:
         coefficients = self.coefficients[shape] if isinstance(shape, int) else shape
         return self.reference + (coefficients @ self.basis).reshape(-1, 3)
 
+    def surface_vertices(self, shape: int | FloatArray) -> FloatArray:
+        """Return the vertices (V, 3), mm, of a shape with exact rotations of its parts; arguments as for `vertices`."""
+        vertices = self.vertices(shape)
+        return self.articulation.decode(vertices) if self.parts else vertices
+
     def mesh(self, shape: int | FloatArray, name: str = "") -> Mesh:
         """Return a shape as a mesh; arguments as for `vertices`."""
         mesh_name = name or (self.names[shape] if isinstance(shape, int) else "shape")
-        return Mesh(self.vertices(shape), self.faces, name=mesh_name)
+        return Mesh(self.surface_vertices(shape), self.faces, name=mesh_name)
 
     def displacements(self, vertices: slice) -> FloatArray:
         """Return the (N, m, 3) displacements, mm, of some vertices from the reference, in all shapes."""
@@ -371,6 +395,7 @@ class Cohort:
         unit: LengthUnit | None = None,
         observed: BoolArray | None = None,
         samples: Sequence[ShapeSamples | None] = (),
+        parts: Mapping[str, int] | None = None,
     ) -> Cohort:
         """Return the cohort of shapes (N, V, 3) in correspondence, mm, after generalised Procrustes.
 
@@ -393,6 +418,7 @@ class Cohort:
             observed: (N, V) bool, False for vertices that are missing too; None if all others are observed.
             samples: N samples of completed shapes, whose unobserved vertices are used as they are; None for each other
                 shape.
+            parts: name -> number of vertices of each part of the objects; None for objects of one part.
 
         Raises:
             InputError: too few shapes, infinite values, too few observed vertices in a shape, columns of
@@ -418,9 +444,22 @@ class Cohort:
         is_observed = is_known.copy()
         is_observed[completed_rows] = True
         mask, analysed = None if is_observed.all() else is_observed, None
-        sizes = read_only([centroid_size(shape) for shape in shapes])
+        parts = dict(parts or {})
+        if parts and (sum(parts.values()) != shapes.shape[1] or not align):
+            raise InputError(
+                f"The parts have {sum(parts.values())} vertices ({_part_counts(parts)}), and the shapes "
+                f"{shapes.shape[1]}; give the number of vertices of each part, and align the shapes."
+            )
+        counts = tuple(parts.values())
+        sizes = read_only([size_of_parts(shape, counts) if parts else centroid_size(shape) for shape in shapes])
+        reference = None
         if onto is not None:
             gauge, analysed = onto.gauge, onto.analysed
+            if parts != dict(onto.parts):
+                raise InputError(
+                    f"Shapes with the parts ({_part_counts(parts) or 'none'}) cannot be compared with shapes with the "
+                    f"parts ({_part_counts(onto.parts) or 'none'}); give shapes of the same parts."
+                )
             if shapes.shape[1] != onto.n_vertices:
                 noun = "landmarks" if onto.source.kind == "landmarks" else "vertices"
                 raise InputError(
@@ -428,12 +467,26 @@ class Cohort:
                 )
             if analysed is not None:
                 mask = None if is_observed[:, analysed].all() else np.logical_and(is_observed, analysed)
+            if mask is not None and parts:
+                raise InputError(
+                    "Shapes of several parts with missing vertices cannot be compared with other shapes; complete them "
+                    "with shapespace complete."
+                )
             if mask is not None:
                 shapes = _complete_by(onto, shapes, is_observed, shape_names)
             if mask is not None or analysed is not None:
                 part = slice(None) if analysed is None else analysed
                 sizes = read_only([centroid_size(shape[part]) for shape in shapes])
             _align_to(shapes, onto)
+        elif parts:
+            if mask is not None:
+                completed = completed_parts(shapes, is_observed, shape_names, parts)
+                shapes, mask = completed.shapes, completed.observed
+                sizes = read_only([size_of_parts(shape, counts) for shape in shapes])
+                analysed = None if completed.analysed.all() else completed.analysed
+            align_in_place(shapes, "form")
+            articulation, poses, _ = articulate(shapes, counts, gauge)
+            shapes, reference = np.stack([articulation.to_tangent(own) for own in poses]), articulation.template
         elif mask is not None:
             completed = completed_shapes(shapes, is_observed, shape_names, gauge, faces, align=align)
             shapes, mask, sizes = completed.shapes, completed.observed, read_only(completed.sizes_mm)
@@ -442,7 +495,7 @@ class Cohort:
             align_in_place(shapes, gauge)
             if gauge == "shape":
                 scale_to_tangent(shapes)
-        reference = shapes.mean(axis=0)
+        reference = shapes.mean(axis=0) if reference is None else reference
         basis, coefficients = _orthonormal((shapes - reference).reshape(len(shapes), -1))
         cohort = Cohort(
             names=shape_names,
@@ -458,6 +511,7 @@ class Cohort:
             analysed=analysed,
             samples=tuple(samples) if completed_rows else (),
             unit=unit if unit is not None else "" if np.abs(sizes - 1.0).max() < _UNIT_SIZE else "mm",
+            parts=parts,
         )
         check_distinct(cohort)
         return cohort
@@ -507,9 +561,10 @@ class Cohort:
         onto: Cohort | None = None,
         least: int = 2,
         samples: Sequence[ShapeSamples | None] = (),
+        parts: Mapping[str, int] | None = None,
     ) -> Cohort:
-        """Return the cohort of meshes in correspondence, mm, after generalised Procrustes; for `onto`, `least` and
-        `samples` see `of_shapes`.
+        """Return the cohort of meshes in correspondence, mm, after generalised Procrustes; for `onto`, `least`,
+        `samples` and `parts` see `of_shapes`.
 
         Raises:
             CorrespondenceError: meshes that differ in vertices or triangles.
@@ -524,7 +579,7 @@ class Cohort:
         observed = np.stack([all_observed if mesh.observed is None else mesh.observed for mesh in meshes])
         cohort = Cohort.of_shapes(
             shapes, {}, names=names, faces=faces, gauge=gauge, onto=onto, least=least, observed=observed,
-            samples=samples,
+            samples=samples, parts=parts,
         )  # fmt: skip
         stds = [mesh.position_std for mesh in meshes if mesh.position_std is not None]
         if len(stds) < len(meshes):
@@ -563,8 +618,18 @@ class Cohort:
                 f"The size of {list_names(without_size)} is not known in mm, so forms cannot be compared; fit with "
                 "--unit, or compare shapes with --set gauge=shape."
             )
-        if gauge == "form" or model.gauge == "form":
-            centre = reference.mean(axis=0)
+        centre, parts = reference.mean(axis=0), parts_of_model(model)
+        if parts:
+            surfaces, counts = [model.reconstruct(row) for row in b], tuple(parts.values())
+            if gauge == "form":
+                scales = sizes_mm / [centroid_size(x) for x in surfaces]
+                reference = centre + float(scales.mean()) * (reference - centre)
+            else:
+                scales = size_of_parts(reference, counts) / np.array([size_of_parts(x, counts) for x in surfaces])
+            articulation = Articulation(reference, counts)
+            shapes = np.stack([articulation.encode(s * x) for s, x in zip(scales, surfaces, strict=True)])
+            rows, b = (shapes - reference).reshape(len(shapes), -1), np.eye(len(shapes))
+        elif gauge == "form" or model.gauge == "form":
             middle = (reference - centre).ravel()
             if gauge == "form":
                 scales = sizes_mm / np.array([centroid_size(reference + (row @ rows).reshape(-1, 3)) for row in b])
@@ -588,9 +653,19 @@ class Cohort:
             landmarks=model.landmarks,
             fitted=fitted,
             source=fitted.source("coefficients"),
+            parts=parts,
         )
         check_distinct(cohort)
         return cohort
+
+
+def parts_of_model(model: ShapeModel) -> dict[str, int]:
+    """Return the number of vertices of each part of a model of shapes and relative poses; empty for other models."""
+    return {} if model.is_linear else {name: len(model.regions[name]) for name in model.parts}
+
+
+def _part_counts(parts: Mapping[str, int]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in parts.items())
 
 
 def _combine_masks(mask: BoolArray | None, known: BoolArray | None, analysed: BoolArray | None) -> BoolArray | None:
@@ -603,7 +678,17 @@ def _combine_masks(mask: BoolArray | None, known: BoolArray | None, analysed: Bo
 
 
 def _align_to(shapes: FloatArray, onto: Cohort) -> None:
-    """Move each of `shapes` (N, V, 3) in place to the mean of a cohort; in the `shape` gauge to its tangent plane."""
+    """Move each of `shapes` (N, V, 3) in place to the mean of a cohort; in the `shape` gauge to its tangent plane.
+
+    Shapes of several parts become tangent vertices.
+    """
+    if onto.parts:
+        counts = onto.articulation.counts
+        common = np.mean([size_of_parts(onto.part_shapes(row), counts) for row in range(len(onto))])
+        for k, shape in enumerate(shapes):
+            scale = common / size_of_parts(shape, counts) if onto.gauge == "shape" else 1.0
+            shapes[k] = onto.articulation.encode(scale * shape)
+        return
     mean_shape = onto.vertices(onto.coefficients.mean(axis=0))
     part = slice(None) if onto.analysed is None else onto.analysed
     mean = mean_shape[part]

@@ -5,7 +5,7 @@ The estimates depend on the shapes alone, never on the table, so that permutatio
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -95,6 +95,48 @@ def completed_shapes(
         posed = np.stack([x if T is None else T.apply(x) for T, x in zip(poses, masked_shapes, strict=True)])
         out[:, ~analysed] = _one_position(posed, completion.shapes.mean(axis=0), analysed, faces)
     return ImputedShapes(out, sizes, known, analysed)
+
+
+def completed_parts(
+    shapes: FloatArray, observed: BoolArray, names: Sequence[str], parts: Mapping[str, int]
+) -> ImputedShapes:
+    """Complete shapes of several parts in their own poses: each part in its own frame, then parts that are missing.
+
+    A shape lacks a part of which it shows less than `MIN_SEEN`; such parts are estimated from the others.
+
+    Args:
+        shapes: (N, V, 3) vertices, mm; any value if not observed.
+        observed: (N, V) whether each vertex is observed.
+        names: names of the N shapes.
+        parts: name -> number of vertices of each part.
+
+    Raises:
+        InputError: most shapes lack a part, or too little of a shape is observed.
+    """
+    out, known, analysed = shapes.copy(), observed.copy(), np.ones(shapes.shape[1], dtype=np.bool_)
+    present, start = np.zeros_like(observed), 0
+    for part, count in parts.items():
+        own = slice(start, start + count)
+        rows: list[int] = np.flatnonzero(observed[:, own].mean(axis=1) >= MIN_SEEN).tolist()
+        if len(rows) < max(MIN_SEEN * len(shapes), _FEWEST_SHAPES):
+            raise InputError(
+                f"The part {part} is missing in {len(shapes) - len(rows)} of {len(shapes)} shapes, which is more than "
+                "half; exclude the part, or give more shapes that have it."
+            )
+        present[rows, own] = True
+        start += count
+        if observed[rows, own].all():
+            continue
+        part_names = [names[row] for row in rows]
+        completed = completed_shapes(out[rows, own], observed[rows, own], part_names, "form", None, align=True)
+        known[rows, own], analysed[own] = completed.observed, completed.analysed
+        for row, shape, seen in zip(rows, completed.shapes, completed.observed, strict=True):
+            there = np.arange(own.start, own.stop)[seen]
+            out[row, own] = fit_similarity(shape[seen], out[row, there], with_scale=False).apply(shape)
+    known &= present
+    if not present.all():
+        out = completed_shapes(out, present, names, "form", None, align=True).shapes
+    return ImputedShapes(out, np.array([centroid_size(shape) for shape in out]), known & analysed, analysed)
 
 
 def _check_observed(known: BoolArray, names: Sequence[str]) -> None:

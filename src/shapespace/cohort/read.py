@@ -15,7 +15,7 @@ from typing import Any, Literal, TypeAlias, cast, get_args
 
 import numpy as np
 
-from shapespace.cohort.cohort import SUBJECT, Cohort, FitDiagnostics, ShapeSource
+from shapespace.cohort.cohort import SUBJECT, Cohort, FitDiagnostics, ShapeSource, parts_of_model
 from shapespace.cohort.landmark_cohort import has_landmarks, landmark_cohort, read_landmark_cohort
 from shapespace.cohort.orientation import find_orientation
 from shapespace.cohort.shape_samples import ENDING, SampleFile, find_samples
@@ -401,7 +401,7 @@ def _cohort_of_results(
             if on_shape is not None:
                 on_shape(index + 1, len(fits))
         cohort = replace(
-            Cohort.of_meshes(meshes, stated, config.gauge, onto, config.least),
+            Cohort.of_meshes(meshes, stated, config.gauge, onto, config.least, parts=parts_of_model(model)),
             fitted=fitted,
             landmarks=model.landmarks,
             sizes_mm=sizes,
@@ -455,7 +455,7 @@ def _cohort_of_surfaces(
             on_shape(n_read, len(matched))
     cohort = Cohort.of_meshes(
         meshes, replace(table.take([row for _, row in matched]), rows=tuple(mesh.name for mesh in meshes)),
-        config.gauge, onto, config.least, samples,
+        config.gauge, onto, config.least, samples, listing.parts,
     )  # fmt: skip
     if 1 < cohort.imputations < config.imputations:
         notes.append(

@@ -17,6 +17,7 @@ import numpy as np
 from msgspec import structs
 
 from shapespace.cohort.cohort import Cohort, with_columns
+from shapespace.cohort.parts import RELATIVE_POSE, cohorts_of_parts, relative_poses, require_parts
 from shapespace.cohort.table import number_caution
 from shapespace.errors import InputError
 from shapespace.geometry.mirror_plane import mirrored_note
@@ -44,12 +45,12 @@ from shapespace.statistics.dispersion import (
     dispersion_test,
     unequal_variances,
 )
-from shapespace.statistics.effect_size import EFFECT_SIZES, EffectSize, UnknownP, effect_size, permutation_p
+from shapespace.statistics.effect_size import EFFECT_SIZES, EffectSize, UnknownP, effect_size, holm_p, permutation_p
 from shapespace.statistics.methods import AnalysisResult, dispersion_record, methods_of, sample_sizes
 from shapespace.statistics.multiple_imputation import Imputations, over_imputations
 from shapespace.statistics.observation_weights import information, weights_of
 from shapespace.statistics.tolerances import TIE
-from shapespace.step_counter import StepCounter
+from shapespace.step_counter import StepCounter, progress_of_run
 from shapespace.types import FloatArray, read_only, require
 
 SquaresType: TypeAlias = Literal["I", "II", "III"]
@@ -99,6 +100,9 @@ class CompareConfig:
             vary.
         coding: coding of classes, on which tests of type III depend: `deviation` from their mean, or `treatment`,
             differences from the first class, the default of R.
+        pose_axes: three landmarks A, B, C, or numbers of vertices, that define the axes of relative poses of parts:
+            axis 1 points from A to B, axis 2 towards C, axis 3 is perpendicular to both (default: the principal axes of
+            inertia of the part to which the other is attached).
     """
 
     anova_type: SquaresType = "II"
@@ -116,6 +120,7 @@ class CompareConfig:
     errors: Mapping[str, str] = field(default_factory=dict[str, str])
     error_permutation: ErrorPermutation = "units"
     coding: Coding = "deviation"
+    pose_axes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.anova_type not in TYPES:
@@ -262,6 +267,23 @@ class EffectAngle:
     unknown_p: UnknownP | None = None
 
 
+@dataclass(frozen=True)
+class PartTest:
+    """A test of a term for one part, or for the relative poses of the parts.
+
+    Args:
+        part: name of the part, or `relative pose`.
+        shapes: number of shapes that have the part.
+        test: the test.
+        p_family: p corrected over all parts and the relative pose, for this term, after Holm (1979).
+    """
+
+    part: str
+    shapes: int
+    test: TermTest
+    p_family: float
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CompareResult(AnalysisResult):
     """A linear model of shapes on covariates, with its tests.
@@ -279,6 +301,8 @@ class CompareResult(AnalysisResult):
         methods: sample sizes, tests and assumptions.
         repeated_measures: use of several shapes of a subject in the tests; None if all shapes are independent.
         imputations: imputations that p values combine; None without samples of completed shapes.
+        parts: the same comparison for each part, aligned as if there were no others, and for the relative poses; empty
+            for objects of one part.
 
     Example:
         >>> config = ss.statistics.CompareConfig(permutations=99)
@@ -299,6 +323,22 @@ class CompareResult(AnalysisResult):
     methods: Methods
     repeated_measures: RepeatedMeasures | None
     imputations: Imputations | None = None
+    parts: Mapping[str, CompareResult] = field(default_factory=dict[str, "CompareResult"])
+
+    @cached_property
+    def part_tests(self) -> tuple[PartTest, ...]:
+        """Tests of each term for each part and for the relative poses, corrected over them."""
+        found: list[PartTest] = []
+        for term in self.tests:
+            own = [
+                (name, len(result.cohort), test)
+                for name, result in self.parts.items()
+                for test in result.tests
+                if (test.term, test.stratum) == (term.term, term.stratum)
+            ]
+            family = holm_p([test.p for _, _, test in own])
+            found += [PartTest(*of, p) for of, p in zip(own, family, strict=True)]
+        return tuple(found)
 
     @cached_property
     def mean(self) -> FloatArray:
@@ -336,13 +376,6 @@ def _update(result: CompareResult) -> CompareResult:
     return replace(result, effects=effects, methods=structs.replace(result.methods, dispersions=records))
 
 
-@over_imputations(
-    parts=("tests", "effects", "angles", "dispersions", "map", "along", "any_way", "bump"),
-    finish=_update,
-    fixed=lambda result: {
-        "config": replace(result.config, variances="unequal" if result.unequal_variances else "equal")
-    },
-)
 def compare(
     cohort: Cohort,
     formula: str,
@@ -354,6 +387,10 @@ def compare(
 
     The formula may contain the columns of the table and also `size` and `log_size`, the centroid size in mm and its
     logarithm.
+
+    Objects of several parts are compared by the shapes of their parts and the relative poses together, and then by
+    each part and by the relative poses alone. Shapes that lack a part are excluded from the tests of this part and of
+    the relative poses; in the comparison of all together the part is estimated.
 
     If completed shapes have samples, each imputation is tested too, and p values combine them by Rubin's rules.
 
@@ -367,13 +404,43 @@ def compare(
         InputError: a formula that cannot be read, missing columns or values, one group, a constant covariate, terms
             that are linear combinations of others, more columns than shapes, an effect within subjects that too few
             subjects show, or unequal variances with a class of one shape or for an effect that is assumed to be the
-            same in all subjects.
+            same in all subjects, or axes of relative poses for objects of one part.
         ShapespaceError: the extra `statistics` is not installed.
     """
     require(cohort, Cohort, "compare", "read one with shapespace.read_cohort")
     require(formula, str, "compare", "write a formula such as '~ sex + age'")
     config = config or CompareConfig()
     require(config, CompareConfig, "compare", "give the options as CompareConfig(...)")
+    if config.pose_axes:
+        require_parts(cohort, "The option pose_axes")
+        relative_poses(cohort.take([0]), config.pose_axes)
+    parts = cohorts_of_parts(cohort) if cohort.parts else {}
+    runs = 1 + len(parts)
+    result = _compare_shapes(cohort, formula, config, progress=progress_of_run(progress, 0, runs))
+    compared: dict[str, CompareResult] = {}
+    for run, (name, own) in enumerate(parts.items(), 1):
+        # Maps of the relative poses would show rigid motions alone.
+        options = replace(config, bump_width_mm=None, maps=config.maps and name != RELATIVE_POSE)
+        try:
+            compared[name] = _compare_shapes(own, formula, options, progress=progress_of_run(progress, run, runs))
+        except InputError as error:
+            raise InputError(f"The comparison of {name}: {error}") from error
+    family = ("the parts and their relative pose (p of all parts, Holm 1979)",) if compared else ()
+    methods = structs.replace(result.methods, corrected_over=(*result.methods.corrected_over, *family))
+    return replace(result, parts=compared, methods=methods)
+
+
+@over_imputations(
+    parts=("tests", "effects", "angles", "dispersions", "map", "along", "any_way", "bump"),
+    finish=_update,
+    fixed=lambda result: {
+        "config": replace(result.config, variances="unequal" if result.unequal_variances else "equal")
+    },
+)
+def _compare_shapes(
+    cohort: Cohort, formula: str, config: CompareConfig, *, progress: Callable[[int, int], None] | None
+) -> CompareResult:
+    """Return the comparison of shapes as they are, see `compare`."""
     random, config = _random_effects(config, cohort)
     cohort = complete_cohort(
         cohort, [formula], [config.blocks] if config.blocks else [], drop_missing=config.drop_missing

@@ -6,6 +6,7 @@ Ecology and Evolution 9, 2018), function `effect.size`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -56,6 +57,13 @@ def permutation_p(statistic: FloatArray, tail: Literal["upper", "lower"] = "uppe
     slack = TIE * abs(float(statistic[0]))
     extreme = statistic >= statistic[0] - slack if tail == "upper" else statistic <= statistic[0] + slack
     return float(extreme.mean())  # S4
+
+
+def holm_p(p: Sequence[float]) -> tuple[float, ...]:
+    """Return p values corrected over their family by Holm (1979), whatever the dependence of the tests."""
+    order = np.argsort(p, kind="stable")
+    corrected = np.maximum.accumulate(np.minimum(np.asarray(p)[order] * np.arange(len(p), 0, -1), 1.0))
+    return tuple(corrected[np.argsort(order)].tolist())
 
 
 def box_cox_exponent(values: FloatArray) -> float:

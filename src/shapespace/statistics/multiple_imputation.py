@@ -10,14 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass, replace
-from functools import partial, wraps
+from functools import wraps
 from inspect import signature
 from typing import Any, ParamSpec, TypeAlias, TypeVar, cast
 
 import numpy as np
 
 from shapespace.cohort.cohort import Cohort
-from shapespace.step_counter import Progress
+from shapespace.step_counter import progress_of_run
 from shapespace.types import FloatArray, read_only
 
 _P_VALUES = ("p", "p_other", "p_family", "q", "p_value", "directional_p")
@@ -171,14 +171,8 @@ def _analyse_one(
         return value.imputation(k, first)
 
     known: dict[str, Any] = {name: imputed(value) for name, value in options.items()}
-    progress: Progress | None = options.get("progress")
-    if progress is not None:
-        known["progress"] = partial(_report_part, progress, 0 if k is None else k + 1, count + 1)
+    known["progress"] = progress_of_run(options.get("progress"), 0 if k is None else k + 1, count + 1)
     return analyse(*map(imputed, args), **known)
-
-
-def _report_part(progress: Progress, run: int, runs: int, done: int, total: int) -> None:
-    progress(run * total + done, runs * total)
 
 
 def _visit(value: Any, parts: Collection[str], change: Callable[[Any], Mapping[str, Any]]) -> Any:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from shapespace.cohort.cohort import Cohort
+from shapespace.cohort.parts import RELATIVE_POSE
 from shapespace.report.analyses.analysis_report import (
     AnalysisReport,
     Column,
@@ -34,6 +35,7 @@ from shapespace.schemas import CurvePart, Part, Series, SurfaceMapPart, TextPart
 from shapespace.statistics.compare_maps import EffectMap, Tested
 from shapespace.statistics.compare_shapes import MOST_LEVELS, CompareResult, ShapeEffect, TermTest
 from shapespace.statistics.observation_weights import blank_where
+from shapespace.statistics.relative_pose import pose_changes, pose_means, poses_of
 from shapespace.types import BoolArray, FloatArray, Mesh
 
 _LARGEST_SHARE = 0.05
@@ -45,22 +47,25 @@ _BINS = 40  # bins of a histogram of thousands of permutations
 _FEWEST_ARRANGEMENTS = 20
 """Number of different arrangements below which no p value can be small."""
 _PALE = "Vertices that are not found to differ are pale."
+_POSE_DECIMALS = 3  # of degrees and mm in tables of relative poses, below what surfaces show
 _NO_FACES = np.zeros((0, 3), dtype=np.int32)
 
 
 def compare_report(result: CompareResult) -> AnalysisReport:
     """Return a comparison with all that its report shows; files are numbered as its effects are."""
-    effects, config = result.effects, result.config
+    config = result.config
     morphospace, plotted = compared_morphospace(result)
-    arrays = {f"effect_{number}.npz": _arrays(result, effect) for number, effect in enumerate(effects, 1)}
+    every = list(_effects_of_all(result))
+    arrays = {f"{file}.npz": _arrays(own, effect) for _, own, effect, file in every}
     content: list[Part | ResultTable] = [
         _term_table(result),
+        *_part_tables(result),
         *_term_histograms(result),
         _effect_table(result),
         *_angle_tables(result),
         morphospace,
-        *(part for effect, (file, own) in zip(effects, arrays.items(), strict=True)
-          for part in _effect_parts(result, effect, file, own)),
+        *(drawn for part, own, effect, file in every
+          for drawn in _effect_parts(own, effect, f"{file}.npz", arrays[f"{file}.npz"], part)),
     ]  # fmt: skip
     return cohort_report(
         "compare",
@@ -69,8 +74,16 @@ def compare_report(result: CompareResult) -> AnalysisReport:
         result.cohort,
         summary=tuple(_summary(result)),
         arrays={morphospace.arrays: plotted, **arrays},
-        meshes=dict(_meshes(result)),
-        notes=(*result.cohort.notes, *_repeated_measures_notes(result)),
+        meshes=dict(_meshes(every)),
+        notes=tuple(
+            dict.fromkeys(
+                (
+                    *result.cohort.notes,
+                    *_repeated_measures_notes(result),
+                    *(note for own in result.parts.values() for note in own.cohort.notes),
+                )
+            )
+        ),
         settings={
             "formula": result.design.formula,
             "squares": config.anova_type,
@@ -88,6 +101,7 @@ def compare_report(result: CompareResult) -> AnalysisReport:
             "subjects": result.n_subjects,
             **({} if config.bump_width_mm is None else {"bump_width_mm": config.bump_width_mm}),
             **({"weights": config.weights} if result.cohort.source.kind == "corresponding" else {}),
+            **({"parts": dict(result.cohort.parts), "pose_axes": list(config.pose_axes)} if result.parts else {}),
             **({"errors": dict(config.errors), "error_permutation": config.error_permutation} if config.errors else {}),
         },
         methods=result.methods,
@@ -97,26 +111,135 @@ def compare_report(result: CompareResult) -> AnalysisReport:
 
 def _summary(result: CompareResult) -> Iterator[str]:
     """Yield the results of terms with their limits, warnings on all terms, the sample, and then maps."""
-    shapes, kind = len(result.cohort), {"box-cox": "Box-Cox", "log": "log F"}[result.config.effect_size]
-    for test in result.tests:
-        figures = f"R² {100 * test.r2:.1f} %, F {test.f:.2f}, Z {test.z:.1f} by {kind}, {_p_text(test.p)}"
-        stratum = f" {test.stratum.partition(':')[0]}" if test.stratum else ""
-        limits = _limits(result, test)
-        if test.p <= result.config.alpha:
-            yield f"Shape differs with {test.term}{stratum} ({figures}{limits})."
-        else:
-            yield f"No difference of shape with {test.term}{stratum} is found ({figures}{limits})."
+    yield from _term_sentences(result)
+    for name, own in result.parts.items():
+        yield from _term_sentences(own, name, {t.test.term: t.p_family for t in result.part_tests if t.part == name})
+    yield from _pose_sentences(result)
     yield from compare_warnings(result)
+    shapes = len(result.cohort)
     of_subjects = f" of {result.n_subjects} subjects" if result.n_subjects < shapes else ""
     yield f"{shapes} shapes{of_subjects}, {result.config.permutations} arrangements, the observed one among them."
     yield multiplicity_sentence(result.methods)
-    for effect in result.effects:
+    for part, own, effect, _ in _effects_of_all(result):
+        label = f"{part}, {effect.label}" if part else effect.label
         if effect.map is not None:
-            yield _map_sentence(result, effect, effect.map)
+            yield _map_sentence(own, effect, effect.map, label)
             if effect.map.blank is not None:
-                yield f"{effect.label}: {blank_sentence(int(effect.map.blank.sum()), len(effect.map.blank))}"
+                yield f"{label}: {blank_sentence(int(effect.map.blank.sum()), len(effect.map.blank))}"
             if effect.map.bump is not None and effect.map.bump_mm is not None:
-                yield _bump_sentence(result, effect, effect.map.bump, effect.map.bump_mm)
+                yield _bump_sentence(own, effect, effect.map.bump, effect.map.bump_mm)
+
+
+def _effects_of_all(result: CompareResult) -> Iterator[tuple[str, CompareResult, ShapeEffect, str]]:
+    """Yield the effects of all parts together, then of each part: name of the part, its comparison, effect, file."""
+    for number, effect in enumerate(result.effects, 1):
+        yield "", result, effect, f"effect_{number}"
+    for part, (name, own) in enumerate(result.parts.items(), 1):
+        for number, effect in enumerate(own.effects, 1):
+            yield name, own, effect, f"part_{part}_effect_{number}"
+
+
+def _term_sentences(result: CompareResult, part: str = "", family: Mapping[str, float] | None = None) -> Iterator[str]:
+    """Yield a sentence on each term; `family` are p values over all parts."""
+    kind = {"box-cox": "Box-Cox", "log": "log F"}[result.config.effect_size]
+    subject = "shape including relative pose" if result.parts else part or "shape"
+    subject = f"the shape of {part}" if part in result.cohort.parts or (part and part != RELATIVE_POSE) else subject
+    for test in result.tests:
+        p = test.p if family is None else family[test.term]
+        figures = f"R² {100 * test.r2:.1f} %, F {test.f:.2f}, Z {test.z:.1f} by {kind}, {_p_text(test.p)}"
+        figures += "" if family is None else f", {p:.3g} over all parts"
+        stratum = f" {test.stratum.partition(':')[0]}" if test.stratum else ""
+        limits = _limits(result, test)
+        if p <= result.config.alpha:
+            yield f"{subject[0].upper()}{subject[1:]} differs with {test.term}{stratum} ({figures}{limits})."
+        else:
+            yield f"No difference of {subject} with {test.term}{stratum} is found ({figures}{limits})."
+
+
+def _pose_sentences(result: CompareResult) -> Iterator[str]:
+    """Yield the change of the relative pose at each joint by each effect, in degrees and lengths."""
+    if not result.parts:
+        return
+    for label, change in pose_changes(result).items():
+        for joint, values in zip(poses_of(result).joints, change, strict=True):
+            yield (
+                f"{label}: {joint} rotates by {np.linalg.norm(values[:3]):.1f}° and moves by "
+                f"{_lengths(result).text(float(np.linalg.norm(values[3:])))} at the joint."
+            )
+
+
+def _part_tables(result: CompareResult) -> Iterator[ResultTable]:
+    """Yield the tests of each part and of the relative pose, and the relative poses; nothing for one part."""
+    if not result.parts:
+        return
+    strata, lengths = any(test.stratum for test in result.tests), _lengths(result)
+    yield ResultTable(
+        title="Parts and relative pose",
+        level=2,
+        note="Each part is aligned as if there were no others; distances of relative poses are mm of vertices. The "
+        "last column corrects p over all parts and the relative pose, for each term (Holm 1979).",
+        columns=(
+            Column("part", field="part"), Column("term", field="term"),
+            Column("tested" if strata else "", field="stratum"), Column("shapes", "count", "shapes"),
+            Column("R²", "percent", "r2"), Column("F", "number", "f"), Column("Z", "number", "z"),
+            Column("p", "p", "p"), Column("p of all parts", "p", "p_of_all_parts"),
+        ),
+        rows=[
+            (own.part, own.test.term, own.test.stratum, own.shapes, own.test.r2, own.test.f, own.test.z, own.test.p,
+             own.p_family)
+            for own in result.part_tests
+        ],
+        file="parts.csv",
+    )  # fmt: skip
+    angle = [Column(f"rotation {k}, degrees", "number", f"rotation_{k}_degrees") for k in (1, 2, 3)]
+    numbers = (
+        *angle,
+        *(Column(lengths.label(f"translation {k}"), "number", lengths.field(f"translation_{k}")) for k in (1, 2, 3)),
+    )
+    poses = poses_of(result)
+    axes = (
+        f"Axis 1 points from {result.config.pose_axes[0]} to {result.config.pose_axes[1]}, axis 2 towards "
+        f"{result.config.pose_axes[2]}, axis 3 is perpendicular to both"
+        if result.config.pose_axes
+        else "Axes are the principal axes of inertia of the part to which the other is attached, the longest first"
+    )
+    yield ResultTable(
+        title="Mean relative pose",
+        note="Relative to the mean of all shapes: components of the rotation vector, and displacements at the joint, "
+        f"with 95 % intervals of the mean and standard deviations between subjects. {axes}.",
+        columns=(
+            Column("shapes", field="group"), Column("joint", field="joint"), Column("subjects", "count", "subjects"),
+            Column("component", field="component"), *(Column(name, "number", name) for name in ("mean", "low", "high")),
+            Column("standard deviation", "number", "stddev"),
+        ),
+        rows=[
+            (own.group, own.joint, own.subjects, column.name, *values)
+            for own in pose_means(result)
+            for column, *values in zip(numbers, *(np.round(v, _POSE_DECIMALS) + 0.0 for v in
+                                                  (own.mean, own.low, own.high, own.stddev)), strict=True)
+        ],
+        file="pose_means.csv",
+    )  # fmt: skip
+    yield ResultTable(
+        title="Change of relative pose",
+        note=f"Change of least-squares means from low to high. {axes}.",
+        columns=(Column("from, to", field="change"), Column("joint", field="joint"), *numbers),
+        rows=[
+            (label, joint, *(np.round(values, _POSE_DECIMALS) + 0.0))
+            for label, change in pose_changes(result).items()
+            for joint, values in zip(poses.joints, change, strict=True)
+        ],
+        file="pose_changes.csv",
+    )
+    yield ResultTable.of_fields(
+        "pose.csv",
+        ("specimen", "joint", *(column.field for column in numbers)),
+        [
+            (name, joint, *values)
+            for name, own in zip(poses.names, poses.numbers, strict=True)
+            for joint, values in zip(poses.joints, own, strict=True)
+        ],
+    )
 
 
 def _limits(result: CompareResult, test: TermTest) -> str:
@@ -255,15 +378,15 @@ def _repeated_measures_notes(result: CompareResult) -> Iterator[str]:
 _EXPLORATORY = "exploratory, since its term is not significant: "
 
 
-def _map_sentence(result: CompareResult, effect: ShapeEffect, effect_map: EffectMap) -> str:
+def _map_sentence(result: CompareResult, effect: ShapeEffect, effect_map: EffectMap, label: str) -> str:
     """Return a sentence on the map of an effect; the map is exploratory if no term of the effect is significant."""
     level = result.config.alpha
     scope = f"family-wise error {100 * level:g} % within this map"
     significant = effect_map.test.p_family <= level
     if not significant.any():
-        return f"{effect.label}: no vertex differs ({scope})."
+        return f"{label}: no vertex differs ({scope})."
     return (
-        f"{effect.label}: {_EXPLORATORY if effect.exploratory else ''}{int(significant.sum()):,} of "
+        f"{label}: {_EXPLORATORY if effect.exploratory else ''}{int(significant.sum()):,} of "
         f"{len(significant):,} vertices differ ({scope}), the clearest by {_clearest(result, effect_map)}."
     )
 
@@ -405,11 +528,11 @@ def _angle_tables(result: CompareResult) -> Iterator[ResultTable]:
 
 
 def _effect_parts(
-    result: CompareResult, effect: ShapeEffect, file: str, arrays: Mapping[str, npt.NDArray[Any]]
+    result: CompareResult, effect: ShapeEffect, file: str, arrays: Mapping[str, npt.NDArray[Any]], part: str
 ) -> Iterator[Part]:
     level = f"{100 * result.config.alpha:g} %"
     yield TextPart(
-        title=effect.label,
+        title=f"{part}: {effect.label}" if part else effect.label,
         level=2,
         text=_size_sentence(result, effect),
     )
@@ -496,8 +619,8 @@ def _arrays(result: CompareResult, effect: ShapeEffect) -> Mapping[str, npt.NDAr
     out: dict[str, npt.NDArray[Any]] = {
         "vertices": cohort.vertices(result.mean),
         "faces": _NO_FACES if cohort.faces is None else cohort.faces,
-        "low": cohort.vertices(effect.at_low - half),
-        "high": cohort.vertices(effect.at_high + half),
+        "low": cohort.surface_vertices(effect.at_low - half),
+        "high": cohort.surface_vertices(effect.at_high + half),
     }
     effect_map = effect.map
     if effect_map is None:
@@ -519,9 +642,8 @@ def _arrays(result: CompareResult, effect: ShapeEffect) -> Mapping[str, npt.NDAr
     return out
 
 
-def _meshes(result: CompareResult) -> Iterator[tuple[str, Mesh]]:
-    if result.cohort.faces is None:
-        return
-    for number, effect in enumerate(result.effects, 1):
-        for end, shape, name in (("low", effect.at_low, effect.low), ("high", effect.at_high, effect.high)):
-            yield f"effect_{number}_{end}.ply", result.cohort.mesh(shape, name)
+def _meshes(every: Iterable[tuple[str, CompareResult, ShapeEffect, str]]) -> Iterator[tuple[str, Mesh]]:
+    for _, result, effect, file in every:
+        if result.cohort.faces is not None:
+            for end, shape, name in (("low", effect.at_low, effect.low), ("high", effect.at_high, effect.high)):
+                yield f"{file}_{end}.ply", result.cohort.mesh(shape, name)

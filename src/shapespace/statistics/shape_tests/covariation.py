@@ -16,6 +16,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from shapespace.cohort.cohort import Cohort
+from shapespace.cohort.parts import require_parts, without_relative_pose
 from shapespace.errors import FileFormatError, InputError
 from shapespace.io.files import read_bytes
 from shapespace.io.read_limits import LARGEST_LANDMARK_FILE_BYTES
@@ -46,30 +47,36 @@ def fit_pls(
 ) -> ShapeTestResult:  # fmt: skip
     """Fit partial least squares of shape and columns of the table, or of modules (the mean of all pairs).
 
+    Modules of objects of several parts are aligned part by part, so that relative pose is no covariation of shape.
+
     These are `two.b.pls` and `integration.test` of geomorph: variables are centred and not standardised.
 
     Args:
         cohort: the shapes.
         columns: columns of numbers, as the first block; shape is the second.
-        modules: table of landmark,module or vertex,module with all landmarks, or vertices (from 0), of each module.
+        modules: table of landmark,module or vertex,module with all landmarks, or vertices (from 0), of each module
+            (default without columns: the parts of the objects).
         permutations: number of permutations of the shapes in one block, including the observed data.
         seed: seed of the permutations.
         drop_missing: exclude shapes with missing values in the table (default: an error).
         progress: function called with (done, total).
 
     Raises:
-        InputError: columns and modules or neither, columns that are no numbers, a block without variance, or modules
-            that the shapes do not have.
+        InputError: columns and modules, or neither for objects of one part, columns that are no numbers, a block
+            without variance, or modules that the shapes do not have.
 
     Example:
         >>> result = ss.statistics.fit_pls(cohort, columns=["age"], permutations=99)
         >>> 0 < result.statistics[0].p <= 1
         True
     """
-    if bool(columns) == (modules is not None):
-        raise InputError("Partial least squares needs either --columns of the table as the first block, or --modules.")
+    if bool(columns) == (modules is not None) and (columns or not cohort.parts):
+        raise InputError(
+            "Partial least squares needs either --columns of the table as the first block, or --modules or shapes of "
+            "several parts."
+        )
     cohort = cohort.complete(columns, drop_missing=drop_missing, numbers=columns)
-    if modules is None:
+    if columns:
         given = np.column_stack([cohort.table.numbers(column) for column in columns])
         blocks = {"columns": given, "shape": cohort.coefficients}
     else:
@@ -118,17 +125,19 @@ def fit_pls(
 
 
 def estimate_modularity(
-    cohort: Cohort, *, modules: Path, permutations: int = 1000, seed: int = 0, drop_missing: bool = False,
+    cohort: Cohort, *, modules: Path | None = None, permutations: int = 1000, seed: int = 0, drop_missing: bool = False,
     progress: Progress | None = None,
 ) -> ShapeTestResult:  # fmt: skip
     """Estimate modularity by the covariance ratio CR (the mean of all pairs of modules).
 
     CR depends on the directions of the axes. As in `modularity.test` of geomorph, it is taken at the rotation in the
-    plane of x and y (steps of 0.05°) at which it is nearest to its mean over all rotations.
+    plane of x and y (steps of 0.05°) at which it is nearest to its mean over all rotations. Objects of several parts
+    are aligned part by part.
 
     Args:
         cohort: the shapes.
-        modules: table of landmark,module or vertex,module with all landmarks, or vertices (from 0), of each module.
+        modules: table of landmark,module or vertex,module with all landmarks, or vertices (from 0), of each module
+            (default: the parts of the objects).
         permutations: number of permutations of the points among modules, including the observed data; the interval is
             from as many bootstrap samples of shapes.
         seed: seed of the permutations and the bootstrap.
@@ -157,7 +166,9 @@ def estimate_modularity(
     own = groups.indicator.T[None]
     ratios = _ratios(own @ norms @ own.transpose(0, 2, 1), _at(own @ variances, _ANGLES), groups)[0].mean(axis=0)
     if not np.isfinite(ratios).all():
-        raise InputError(f"{modules}: the points of a module do not covary, so CR is not defined; give it more points.")
+        raise InputError(
+            f"{modules or 'Parts'}: the points of a module do not covary, so CR is not defined; give it more points."
+        )
     angle = _ANGLES[[int(np.abs(ratios - ratios.mean()).argmin())]]
     diagonal = _at(variances, angle)
 
@@ -170,7 +181,7 @@ def estimate_modularity(
     low, high = np.percentile(_bootstrap(x, groups, permutations, seed), _INTERVAL).tolist()
     return ShapeTestResult(
         name="modularity", cohort=cohort, statistics=(replace(first, low=low, high=high), *pairs),
-        settings={"modules": str(modules), "rotation_degrees": float(np.degrees(angle[0])),
+        settings={"modules": modules and str(modules), "rotation_degrees": float(np.degrees(angle[0])),
                   "mean_over_rotations": float(ratios.mean()), "permutations": permutations, "seed": seed},
         assumptions=("CR depends on the axes; it is taken at the rotation about z at which it is nearest to its mean "
                      "over all rotations. Its interval comes from a bootstrap of shapes.",),
@@ -203,13 +214,21 @@ def _mean_and_pairs(
     return each if len(each) == 1 else [mean, *each]
 
 
-def _modules(cohort: Cohort, path: Path) -> tuple[Cohort, dict[str, list[int]]]:
+def _modules(cohort: Cohort, path: Path | None) -> tuple[Cohort, dict[str, list[int]]]:
     """Read the points of each module, and return them with the cohort, with a note if points are excluded.
+
+    Without a path modules are the parts, each in its own frame.
 
     Raises:
         FileError: the file cannot be read, or is no table of modules.
         InputError: fewer than two modules, a module of one point, points that the shapes lack or that are listed twice.
     """
+    cohort = without_relative_pose(cohort) if cohort.parts else cohort
+    if path is None:
+        require_parts(cohort, "Covariation without --modules")
+        known = np.ones(cohort.n_vertices, np.bool_) if cohort.analysed is None else cohort.analysed
+        own = zip(cohort.parts, cohort.articulation.slices, strict=True)
+        return cohort, {name: (s.start + np.flatnonzero(known[s])).tolist() for name, s in own}
     noun = "landmarks" if cohort.source.kind == "landmarks" else "vertices"
     titles, *rows = read_rows(path, read_bytes(path, LARGEST_LANDMARK_FILE_BYTES))
     header = [title.lower() for title in titles]

@@ -169,7 +169,6 @@ SHAPE_TESTS: tuple[ShapeTest, ...] = (
         ),
         example="shapespace test integration people.csv --modules modules.csv -o integration",
         options={"modules": "FILE"},
-        required=("modules",),
     ),
     ShapeTest(
         name="modularity",
@@ -183,7 +182,6 @@ SHAPE_TESTS: tuple[ShapeTest, ...] = (
         ),
         example="shapespace test modularity people.csv --modules modules.csv -o modularity",
         options={"modules": "FILE"},
-        required=("modules",),
     ),
     ShapeTest(
         name="signal",
