@@ -25,6 +25,7 @@ from shapespace.report.inputs.correspondence_folder import (
     distance_share,
     scan_status,
 )
+from shapespace.report.inputs.parts import Parts
 from shapespace.report.inputs.saved_fits import ScanNotFoundError
 from shapespace.report.render.scene import bounded_scan, decimate, pack, quantise
 from shapespace.report.render.thumbnails import SQUARES, checker_places, mean_at_vertices
@@ -71,6 +72,7 @@ class Surfaces:
             "corresponding": len(self._corresponded.corresponding),
             "vertices": len(self._corresponded.mean.vertices),
             "rounds": list(run.rounds),
+            "parts": list(run.parts),
             "page": max(1, min(_PAGE, page)),
             "is_large": len(self._corresponded.corresponding) * len(self._corresponded.mean.vertices) > _LARGE,
             "most_marked": MAX_MARKED,
@@ -97,6 +99,8 @@ class Surfaces:
             "draft": np.asarray(kept[kept_turning][faces_of(turning)], dtype=np.uint32),
             "places": np.stack([along, across], axis=1),
         }
+        if (parts := Parts.of_counts(self._corresponded.run.parts)) is not None:
+            arrays["parts"] = parts.labels
         return pack(arrays, {"turn": self._corresponded.turn.tolist()})
 
     def packed_population(self) -> bytes:

@@ -17,22 +17,23 @@
       this._things = new Map();
       this._marks = new Map();
       this._texts = new Map();
+      this._arrangement = { hidden: new Set(), apart: 0 };
       if (works) this._scene = new THREE.Scene();
     }
 
     /**
      * Show a surface, or points where faces is null; positions Float32Array(3V), faces Uint32Array(3F). draft: fewer
-     * triangles between some of the same vertices, drawn while the surface moves where the processor draws.
+     * triangles between some of the same vertices, drawn while the surface moves where the processor draws. parts: number
+     * of the part of each vertex, if there are several, which have colours of their own, see `arrange`.
      */
-    setSurface(id, { positions, faces = null, draft = null, colour = CLAY, opacity = 1, visible = true, size = null }) {
+    setSurface(id, { positions, faces = null, draft = null, parts = null, colour = CLAY, opacity = 1, visible = true, size = null }) {
       if (!this.works) return;
       this.remove(id);
-      const thing = { id, colour, opacity, visible, faces: null, given: { faces, draft }, positions, paint: null, size };
+      const thing = { id, colour, opacity, visible, faces: null, given: { faces, draft, parts }, positions, paint: null, size };
       const geometry = new THREE.BufferGeometry();
-      const known = new Float32Array(positions);
-      const bad = replaceUnknown(known);
+      const known = new Float32Array(this._apart(positions, parts));
+      const bad = (thing.bad = withHidden(replaceUnknown(known), parts, this._arrangement.hidden));
       thing.faces = faces && faces.length ? usable(faces, known.length / 3, bad) : null;
-      thing.positions = known;
       geometry.setAttribute("position", dynamic(known, 3));
       geometry.setAttribute("value", dynamic(new Float32Array((2 * known.length) / 3), 2));
       geometry.setAttribute("own", new THREE.BufferAttribute(new Uint8Array(known.length), 3, true));
@@ -57,6 +58,43 @@
       this._scene.add(thing.object);
       this._things.set(id, thing);
       this.set(id, {});
+      this.paint(id, null);
+    }
+
+    /** Positions with the parts apart, each along the line from the middle of all parts; the given array if nothing changes. */
+    _apart(positions, parts) {
+      const { apart } = this._arrangement;
+      if (!parts || !apart) return positions;
+      const sums = [];
+      for (let v = 0, i = 0; v < parts.length; v++, i += 3) {
+        const sum = (sums[parts[v]] = sums[parts[v]] || [0, 0, 0, 0]), x = positions[i], y = positions[i + 1], z = positions[i + 2];
+        if (Number.isFinite(x + y + z)) { sum[0] += x; sum[1] += y; sum[2] += z; sum[3] += 1; }
+      }
+      const centres = sums.map(([x, y, z, count]) => [x / count, y / count, z / count]), known = centres.filter(([x]) => Number.isFinite(x));
+      const middle = [0, 1, 2].map((axis) => known.reduce((sum, centre) => sum + centre[axis] / known.length, 0));
+      const shifts = centres.map((centre) => centre.map((value, axis) => apart * (value - middle[axis])));
+      return positions.map((value, i) => value + shifts[parts[Math.floor(i / 3)]][i % 3]);
+    }
+
+    /** Where the vertices of a surface are drawn, not-a-number where its part is hidden. */
+    placed(id, positions) {
+      const parts = this._things.get(id)?.given.parts, { hidden } = this._arrangement, shown = this._apart(positions, parts);
+      return parts && hidden.size ? shown.map((value, i) => (hidden.has(parts[Math.floor(i / 3)]) ? NaN : value)) : shown;
+    }
+
+    /** Hide the parts whose numbers are in `hidden`, and move parts apart by a multiple of their distances from the middle. */
+    arrange({ hidden, apart }) {
+      const moves = apart !== this._arrangement.apart;
+      this._arrangement = { hidden: new Set(hidden), apart };
+      for (const thing of Array.from(this._things.values())) if (thing.given?.parts) this._setAgain(thing, thing.positions);
+      if (moves) this.refit();
+    }
+
+    /** Show a surface again at other positions, as it was. */
+    _setAgain({ id, colour, opacity, visible, given, paint, size }, positions) {
+      this.setSurface(id, { positions, ...given, colour, opacity, visible, size });
+      const each = paint && paint.options.squares ? 2 : 1;
+      if (paint && paint.values.length === (each * positions.length) / 3) this.paint(id, paint.values, paint.options);
     }
 
     /** Move the vertices of a surface; triangles and paint stay. */
@@ -64,16 +102,12 @@
       const thing = this._things.get(id);
       if (!thing) return;
       const attribute = thing.object.geometry.attributes.position;
+      const shown = this._apart(positions, thing.given.parts);
       let sum = 0;
-      for (let i = 0; i < positions.length; i++) sum += positions[i];
-      if (positions.length !== attribute.array.length || !Number.isFinite(sum)) {
-        const { colour, opacity, visible, given, paint, size } = thing;
-        this.setSurface(id, { positions, ...given, colour, opacity, visible, size });
-        const each = paint && paint.options.squares ? 2 : 1;
-        if (paint && paint.values.length === (each * positions.length) / 3) this.paint(id, paint.values, paint.options);
-        return;
-      }
-      attribute.array.set(positions);
+      for (let i = 0; i < shown.length; i++) sum += shown[i];
+      if (shown.length !== attribute.array.length || !Number.isFinite(sum)) return this._setAgain(thing, positions);
+      thing.positions = positions;
+      attribute.array.set(shown);
       attribute.needsUpdate = true;
       if (thing.faces) {
         normalsOf(attribute.array, thing.faces, thing.object.geometry.attributes.normal.array);
@@ -94,6 +128,12 @@
       if (!values) {
         thing.paint = null;
         uniforms.paint.value = 0;
+        if (thing.given?.parts) {
+          const { own } = thing.object.geometry.attributes, bytes = Shapespace.colours.parts.map((colour) => colour.map((c) => Math.round(255 * c)));
+          thing.given.parts.forEach((part, v) => own.array.set(bytes[part % bytes.length], 3 * v));
+          own.needsUpdate = true;
+          uniforms.paint.value = 4;
+        }
         this.request();
         return;
       }
@@ -232,6 +272,14 @@
     }
     if (bad) for (const v of bad) positions.fill(0, 3 * v, 3 * v + 3);
     return bad;
+  }
+
+  /** The set of vertices that are not drawn, with those of hidden parts, or null. */
+  function withHidden(bad, parts, hidden) {
+    if (!parts || !hidden.size) return bad;
+    const all = bad || new Set();
+    parts.forEach((part, v) => { if (hidden.has(part)) all.add(v); });
+    return all;
   }
 
   /** The triangles whose three vertices exist and are finite. */

@@ -54,6 +54,12 @@ CATEGORIES: tuple[Colour, ...] = (
     (0.420, 0.080, 0.060),
 )
 
+PARTS: tuple[Colour, ...] = tuple(
+    (int(name[:2], 16) / 255, int(name[2:4], 16) / 255, int(name[4:], 16) / 255)
+    for name in ("77aadd", "eedd88", "44bb99", "ffaabb", "99ddff", "bbcc33", "ee8866", "aaaa00")
+)
+"""Colours of the parts of one subject: the scheme light of Tol (SRON/EPS/TN/09-002), made for surfaces."""
+
 _TO_CONES = np.array(
     [
         [0.4122214708, 0.5363325363, 0.0514459929],
