@@ -11,6 +11,7 @@ from threading import Lock
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.geometry.mirror_plane import FLIP
@@ -93,7 +94,7 @@ class Surfaces:
         along, across = checker_places(mean)
         drawn, kept = decimate(mean, _MOST_DRAWN)
         turning, kept_turning = decimate(drawn, _MOST_TURNING)
-        arrays = {
+        arrays: dict[str, npt.NDArray[Any]] = {
             "positions": mean.vertices,
             "faces": np.asarray(kept[faces_of(drawn)], dtype=np.uint32),
             "draft": np.asarray(kept[kept_turning][faces_of(turning)], dtype=np.uint32),

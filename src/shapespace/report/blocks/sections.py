@@ -186,10 +186,9 @@ def _parts_of_model(model: ShapeModel) -> list[Block]:
         Head("Part"), Head("Vertices", "number"), Head("Joint with"), Head("Rotation, SD in degrees", "number"),
         Head("Translation, SD in mm", "number"),
     ]  # fmt: skip
-    caption = (
-        f"The parts. Relative pose {pose.choice}: {_RELATIVE_POSE[pose.choice]}. Standard deviations are of the modes"
-    )
-    return [Table(columns, rows, f"{caption}{', to first order.' if pose.choice == 'kept' else '.'}")]
+    order = ", to first order" if pose.choice == "kept" else ""
+    text = f"Relative pose {pose.choice}: {_RELATIVE_POSE[pose.choice]}."
+    return [Table(columns, rows, f"The parts. {text} Standard deviations (SD) are those of the modes{order}.")]
 
 
 def _cells_of_joint(joint: JointSpread | None) -> list[Cell]:

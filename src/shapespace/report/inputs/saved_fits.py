@@ -565,6 +565,7 @@ class StagedFit:
             regions=None,
             **known,
             history=(),
+            parts=None,
         )
 
     @staticmethod
@@ -635,6 +636,7 @@ class StagedFit:
             regions=regions,
             **known,
             history=history,
+            parts=None,
         )
 
 
