@@ -1,17 +1,21 @@
 """Parts of one subject in the browser: vertices as those of Python, colours, hidden and exploded parts."""
 
 import io
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pages import PANE, viewer
 from test_scene_in_browser import SHELL
 
 import shapespace as ss
+from same_blobs import NAMES, write_same
 from shapespace.geometry.articulation import PartPoses
 from shapespace.report.inputs.parts import articulation_of
 from shapespace.report.render import palette, scene
+from shapespace.schemas import CorrespondenceRecord
 from two_parts import VERTICES, two_part_surfaces
 
 COUNTS = {"upper": VERTICES, "lower": VERTICES}
@@ -138,3 +142,37 @@ def test_shape_and_pose_are_moved_apart_only_where_poses_are_modelled(page_of, r
         assert tab.page.locator(".ss-caption").first.text_content() == "Shape only"
         tab.shot("parts-shape-only")
     assert tab.complaints == []
+
+
+def test_surfaces_in_correspondence_show_their_parts_and_marks_of_hidden_ones_are_named(open_tab, tmp_path) -> None:
+    folder = write_same(tmp_path, NAMES)
+    file = folder / CorrespondenceRecord.FILE
+    record = json.loads(file.read_text())
+    below = record["vertices"] // 2
+    file.write_text(json.dumps({**record, "parts": {"first": below, "second": record["vertices"] - below}}))
+    with viewer(folder) as address:
+        tab = open_tab(address)
+        tab.until(f"{PANE}?.dataset.ready === 'true'")
+        page = tab.page
+        page.get_by_test_id("colour-plain").click()
+        assert page.get_by_test_id("colour-plain").inner_text() == "Parts"
+        cells = "window.shapespaceCells.slice(0, 2).map((cell) => "
+        shown = cells + "cell.view._things.get('surface').object.geometry.index.count)"
+        all_shown = page.evaluate(shown)
+        for vertex in (1, below + 1):
+            page.get_by_test_id("number").fill(str(vertex))
+            page.get_by_test_id("mark").click()
+        page.get_by_test_id("part-second").uncheck()
+        assert all(0 < few < 0.7 * many for few, many in zip(page.evaluate(shown), all_shown, strict=True))
+        labels = cells + "cell.view._marks.get('marks').map((mark) => mark.label))"
+        assert page.evaluate(labels) == [["1"]] * 2
+        assert page.get_by_test_id("note-0").inner_text() == f"{below + 1} not shown"
+        page.get_by_test_id("exploded").fill("60")
+        mark = cells + "Array.from(cell.view._marks.get('marks')[0].position))"
+        place = cells + "Array.from(cell.positions.slice(3, 6)))"
+        assert np.abs(np.array(page.evaluate(mark)) - page.evaluate(place)).min(axis=1).max() > 1e-3
+        tab.shot("surfaces")
+        page.get_by_test_id("part-second").check()
+        assert page.evaluate(shown) == all_shown
+        tab.shot("surfaces-exploded")
+        assert tab.complaints == []
