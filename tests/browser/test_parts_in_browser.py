@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pages import PANE, viewer
+from pictures import same_as_kept
 from test_scene_in_browser import SHELL
 
 import shapespace as ss
@@ -19,7 +20,7 @@ from shapespace.schemas import CorrespondenceRecord
 from two_parts import VERTICES, two_part_surfaces
 
 COUNTS = {"upper": VERTICES, "lower": VERTICES}
-PLACE = '<div id="a" style="height: 500px"></div>'
+PLACE = '<div id="a" style="height: 520px; font-family: sans-serif"></div>'
 LOADED = 'Shapespace.load("model").then((u) => { window.model = new Shapespace.Model(u); });'
 WIDGET = """
 Shapespace.widgets.modes(document.getElementById("a"), "model").then((made) => { window.made = made; });
@@ -141,6 +142,11 @@ def test_shape_and_pose_are_moved_apart_only_where_poses_are_modelled(page_of, r
         tab.page.get_by_label("Shape only").check(force=True)
         assert tab.page.locator(".ss-caption").first.text_content() == "Shape only"
         tab.shot("parts-shape-only")
+        tab.page.get_by_label("Shape and pose").check(force=True)
+        tab.page.get_by_test_id("exploded").fill("25")
+        tab.page.wait_for_function("made.view.rests")
+        png = tab.shot("parts-exploded", clip=tab.page.locator("#a").bounding_box())
+        same_as_kept("structures-modes.png", png, width=1000)
     assert tab.complaints == []
 
 

@@ -62,8 +62,25 @@
     }
   }
 
+  /** Positions (3V) with the parts apart: each moves along the line from the middle of all parts to its centre, by a multiple. */
+  function explode(positions, parts, multiple) {
+    const rows = [];
+    for (let v = 0, i = 0; v < parts.length; v++, i += 3) {
+      if (Number.isFinite(positions[i] + positions[i + 1] + positions[i + 2])) (rows[parts[v]] = rows[parts[v]] || []).push(v);
+    }
+    const centres = rows.map((own) => mean(positions, own)), known = centres.filter(Boolean), out = Float32Array.from(positions);
+    const middle = mean(known.flat(), known.map((_, k) => k));
+    rows.forEach((own, part) => {
+      for (let axis = 0; axis < 3; axis++) {
+        const shift = multiple * (centres[part][axis] - middle[axis]);
+        for (const v of own) out[3 * v + axis] += shift;
+      }
+    });
+    return out;
+  }
+
   /** template (3V); parts (V): number of the part of each vertex; joints: [{part, parent, own, other}], as in Python. */
-  window.Shapespace.sceneParts.Articulation = class {
+  class Articulation {
     constructor(template, parts, joints) {
       Object.assign(this, { template: Float64Array.from(template), joints });
       this._rows = Array.from({ length: joints.length + 1 }, () => []);
@@ -113,5 +130,7 @@
       }
       return theta;
     }
-  };
+  }
+
+  Object.assign(window.Shapespace.sceneParts, { Articulation, explode });
 })();

@@ -3,7 +3,7 @@
   "use strict";
 
   const Shapespace = window.Shapespace;
-  const { normalsOf, material, useMap } = Shapespace.sceneParts;
+  const { normalsOf, material, useMap, explode } = Shapespace.sceneParts;
 
   const GREY = [0.66, 0.66, 0.66];
   const SIGNAL = [0.8, 0.1, 0.45];
@@ -61,19 +61,8 @@
       this.paint(id, null);
     }
 
-    /** Positions with the parts apart, each along the line from the middle of all parts; the given array if nothing changes. */
     _apart(positions, parts) {
-      const { apart } = this._arrangement;
-      if (!parts || !apart) return positions;
-      const sums = [];
-      for (let v = 0, i = 0; v < parts.length; v++, i += 3) {
-        const sum = (sums[parts[v]] = sums[parts[v]] || [0, 0, 0, 0]), x = positions[i], y = positions[i + 1], z = positions[i + 2];
-        if (Number.isFinite(x + y + z)) { sum[0] += x; sum[1] += y; sum[2] += z; sum[3] += 1; }
-      }
-      const centres = sums.map(([x, y, z, count]) => [x / count, y / count, z / count]), known = centres.filter(([x]) => Number.isFinite(x));
-      const middle = [0, 1, 2].map((axis) => known.reduce((sum, centre) => sum + centre[axis] / known.length, 0));
-      const shifts = centres.map((centre) => centre.map((value, axis) => apart * (value - middle[axis])));
-      return positions.map((value, i) => value + shifts[parts[Math.floor(i / 3)]][i % 3]);
+      return parts && this._arrangement.apart ? explode(positions, parts, this._arrangement.apart) : positions;
     }
 
     /** Where the vertices of a surface are drawn, not-a-number where its part is hidden. */

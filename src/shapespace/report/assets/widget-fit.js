@@ -106,7 +106,7 @@
         draw();
       } });
       row.row.classList.add("ss-layer");
-      row.row.prepend(box, id === "model" && arrays.parts ? "" : dot(colours()[id]));
+      row.row.prepend(box, id === "model" && arrays.parts ? make("span") : dot(colours()[id]));
       return {
         row: row.row,
         shown: () => ({ visible: box.checked, opacity: row.get() / 100 }),

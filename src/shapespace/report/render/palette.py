@@ -56,9 +56,9 @@ CATEGORIES: tuple[Colour, ...] = (
 
 PARTS: tuple[Colour, ...] = tuple(
     (int(name[:2], 16) / 255, int(name[2:4], 16) / 255, int(name[4:], 16) / 255)
-    for name in ("77aadd", "eedd88", "44bb99", "ffaabb", "99ddff", "bbcc33", "ee8866", "aaaa00")
+    for name in ("77aadd", "eedd88", "ee6677", "228833", "aa3377", "bbbbbb", "99ddff", "cc79a7")
 )
-"""Colours of the parts of one subject: the scheme light of Tol (SRON/EPS/TN/09-002), made for surfaces."""
+"""Colours of the parts of one subject, of Tol and of Okabe and Ito, in an order that keeps the first ones far apart."""
 
 _TO_CONES = np.array(
     [
