@@ -16,8 +16,8 @@ from shapespace.report import figures
 from shapespace.report.analyses.result_report import analysis_report
 from shapespace.report.blocks.blocks import Block, Cell, Head, Notes, Table, Text
 from shapespace.report.blocks.wording import listed, mm, percent, training_text
-from shapespace.report.inputs.parts import part_counts
 from shapespace.report.inputs.saved_fits import Folder, StagedFit
+from shapespace.report.inputs.subject_parts import part_counts
 from shapespace.report.pages.page import Page, template
 from shapespace.report.pages.study_page import ANALYSIS, TITLES, StudyParts
 from shapespace.report.pages.write_html import require_report_extra

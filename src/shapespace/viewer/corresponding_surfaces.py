@@ -26,8 +26,8 @@ from shapespace.report.inputs.correspondence_folder import (
     distance_share,
     scan_status,
 )
-from shapespace.report.inputs.parts import Parts
 from shapespace.report.inputs.saved_fits import ScanNotFoundError
+from shapespace.report.inputs.subject_parts import Parts
 from shapespace.report.render.scene import bounded_scan, decimate, pack, quantise
 from shapespace.report.render.thumbnails import SQUARES, checker_places, mean_at_vertices
 from shapespace.types import FloatArray

@@ -19,7 +19,6 @@ from shapespace.model.foreign import looks_like_model
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report.blocks.wording import without_folders
 from shapespace.report.inputs.fit_population import most_concerning
-from shapespace.report.inputs.parts import Parts
 from shapespace.report.inputs.saved_fits import (
     Folder,
     SavedFit,
@@ -31,6 +30,7 @@ from shapespace.report.inputs.saved_fits import (
     saved_surfaces,
     staged_fit,
 )
+from shapespace.report.inputs.subject_parts import Parts
 from shapespace.report.render.scene import pack_fit, pack_model, pack_surfaces
 from shapespace.schemas import FIT_AGAIN, FitRecord, to_json
 from shapespace.store.manifest import Manifest

@@ -50,7 +50,6 @@ from shapespace.report.blocks.wording import (
     training_text,
     words,
 )
-from shapespace.report.inputs.parts import JointSpread, Parts, part_counts, relative_pose
 from shapespace.report.inputs.saved_fits import (
     Coefficients,
     Direction,
@@ -60,6 +59,7 @@ from shapespace.report.inputs.saved_fits import (
     StagedFit,
     measured_mm,
 )
+from shapespace.report.inputs.subject_parts import JointSpread, Parts, part_counts, relative_pose
 from shapespace.report.pages.page import OrderedPicture, Page
 from shapespace.report.render import thumbnails
 from shapespace.report.render.scene import pack_fit, pack_model, pack_scatter, pack_surfaces

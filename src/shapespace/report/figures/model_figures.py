@@ -39,8 +39,8 @@ from shapespace.report.figures.draw import (
     type_size,
     view,
 )
-from shapespace.report.inputs.parts import Parts
 from shapespace.report.inputs.saved_fits import nice_ceiling
+from shapespace.report.inputs.subject_parts import Parts
 from shapespace.report.render.palette import PARTS, SEQUENTIAL, Colour
 from shapespace.report.render.renderer import Image, Layer, part_layer, render
 from shapespace.schemas import BySize, Measured, Quality, read

@@ -32,7 +32,7 @@ from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.io.tables.table_io import table_rows
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report.blocks.wording import counted, known, printable
-from shapespace.report.inputs.parts import Parts
+from shapespace.report.inputs.subject_parts import Parts
 from shapespace.schemas import FitEntry, FitRecord
 from shapespace.store.results import ENDING, ENDINGS, Results, arrays_at, json_at, mesh_at, results_at
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity

@@ -53,8 +53,8 @@ from shapespace.report.inputs.correspondence_folder import (
     scan_status,
     upright,
 )
-from shapespace.report.inputs.parts import Parts
 from shapespace.report.inputs.saved_fits import Folder, nice_ceiling
+from shapespace.report.inputs.subject_parts import Parts
 from shapespace.report.pages.page import Chapter, Page
 from shapespace.report.render import thumbnails
 from shapespace.report.render.palette import DIVERGING, SEQUENTIAL

@@ -54,7 +54,6 @@ from shapespace.report.blocks.wording import (
     without_folders,
 )
 from shapespace.report.inputs.fit_population import FEWEST, MEASURES, ListedColumn, Population
-from shapespace.report.inputs.parts import Parts
 from shapespace.report.inputs.saved_fits import (
     Coefficients,
     Folder,
@@ -69,6 +68,7 @@ from shapespace.report.inputs.saved_fits import (
     saved_surfaces,
     staged_fit,
 )
+from shapespace.report.inputs.subject_parts import Parts
 from shapespace.report.pages import study_page
 from shapespace.report.pages.page import Chapter, Page
 from shapespace.report.render import thumbnails

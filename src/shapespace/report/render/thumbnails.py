@@ -12,8 +12,8 @@ import numpy as np
 
 from shapespace.errors import InputError
 from shapespace.geometry.normals import Distortion, drawable, faces_of, observed_mask
-from shapespace.report.inputs.parts import Parts
 from shapespace.report.inputs.saved_fits import StagedFit
+from shapespace.report.inputs.subject_parts import Parts
 from shapespace.report.render.palette import CATEGORIES, DIVERGING, MODEL_COLOUR, SCAN_COLOUR, SEQUENTIAL, Colour
 from shapespace.report.render.renderer import (
     SQUARE_COLOURS,
