@@ -20,7 +20,10 @@ from shapespace.schemas import CorrespondenceRecord
 from two_parts import VERTICES, two_part_surfaces
 
 COUNTS = {"upper": VERTICES, "lower": VERTICES}
-PLACE = '<style>* { box-sizing: border-box; }</style><div id="a" style="height: 520px; font-family: sans-serif"></div>'
+PLACE = (
+    "<style>* { box-sizing: border-box; }</style>"
+    '<div id="a" style="padding: 14px; background: #f1efea; font-family: sans-serif"></div>'
+)
 LOADED = 'Shapespace.load("model").then((u) => { window.model = new Shapespace.Model(u); });'
 WIDGET = """
 Shapespace.widgets.modes(document.getElementById("a"), "model").then((made) => { window.made = made; });
