@@ -57,6 +57,9 @@ def test_regions_and_categories_are_told_apart_by_every_reader(kind: str | None)
         assert np.linalg.norm(one - other) > 0.06, (a, b)
     categories = seen(np.array(colours.CATEGORIES), kind)
     assert min(np.linalg.norm(a - b) for a, b in itertools.combinations(categories, 2)) > 0.04
+    parts = seen(np.array(colours.PARTS), kind)
+    assert min(np.linalg.norm(a - b) for a, b in itertools.combinations(parts[:7], 2)) > 0.085
+    assert min(np.linalg.norm(a - b) for a, b in itertools.combinations(parts, 2)) > 0.065
 
 
 def test_the_maps_cannot_be_changed_by_accident() -> None:

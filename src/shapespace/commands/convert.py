@@ -55,7 +55,12 @@ def convert(
             model.save(output)
         else:
             notes += target.write(linear, output)
-    regions = sorted((model if isinstance(model, ShapeModel) else model.shape).regions)
+    shape = model if isinstance(model, ShapeModel) else model.shape
+    if target is not None and not shape.is_linear:
+        notes.append(
+            f"Relative pose is linear in {target.title}: parts that turn by large angles shrink, unlike in the model."
+        )
+    regions = sorted(shape.regions)
     if target is not None and regions:
         notes.append(
             f"Omitted: the region{'' if len(regions) == 1 else 's'} {', '.join(regions)}, which {target.title} has no "

@@ -23,6 +23,7 @@ from shapespace.io.meshes.mesh_io import mesh_files, read_mesh, write_mesh
 from shapespace.model.additive import load_model
 from shapespace.model.foreign import looks_like_model
 from shapespace.model.shape_model import ShapeModel
+from shapespace.report.inputs.subject_parts import part_counts, relative_pose
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, read, to_json
 from shapespace.store.corresponding import json_of
 from shapespace.store.results import Results, mesh_at, modes_of, results_at
@@ -244,6 +245,7 @@ def correspondence_facts(folder: Path) -> dict[str, Any]:
         "needs_review": {name: concern.text for name, concern in concerns.items() if concern.reasons},
         "vertices": len(result.mean.vertices),
         "triangles": len(faces_of(result.mean)),
+        **({"parts": result.run.parts} if result.run.parts else {}),
         "template": result.run.template,
         "units_mixed": result.units_mixed,
         "distance_share_median": far,
@@ -288,7 +290,7 @@ def model_facts(model: ShapeModel) -> dict[str, Any]:
         "landmarks": list(model.landmarks),
         **({"landmark_distances_mm": dict(zip(model.landmarks, off, strict=True))} if any(off) else {}),
         **({"regions": {name: len(vertices) for name, vertices in model.regions.items()}} if model.regions else {}),
-        **({"parts": list(model.parts)} if model.parts else {}),
+        **_facts_of_parts(model),
         "representation": model.representation,
         **({} if counts is None else {"control_points": counts.tolist()}),
         "provenance": model.provenance,
@@ -296,6 +298,19 @@ def model_facts(model: ShapeModel) -> dict[str, Any]:
         **({"notes": list(model.notes)} if model.notes else {}),
         "hash": model.content_hash,
     }
+
+
+def _facts_of_parts(model: ShapeModel) -> dict[str, Any]:
+    """Return the facts of the parts of a model; standard deviations of relative poses are those of its modes."""
+    if (pose := relative_pose(model)) is None:
+        return {}
+    joints = {
+        f"{joint.part} to {joint.parent}": {
+            "rotation_stddev_deg": joint.rotation_deg, "translation_stddev_mm": joint.translation_mm
+        }
+        for joint in pose.joints
+    }  # fmt: skip
+    return {"parts": part_counts(model), "relative_pose": pose.choice, **({"joints": joints} if joints else {})}
 
 
 def training_shapes_note(model: ShapeModel) -> str:

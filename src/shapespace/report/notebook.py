@@ -17,6 +17,7 @@ from shapespace.report.analyses.result_report import analysis_report
 from shapespace.report.blocks.blocks import Block, Cell, Head, Notes, Table, Text
 from shapespace.report.blocks.wording import listed, mm, percent, training_text
 from shapespace.report.inputs.saved_fits import Folder, StagedFit
+from shapespace.report.inputs.subject_parts import part_counts
 from shapespace.report.pages.page import Page, template
 from shapespace.report.pages.study_page import ANALYSIS, TITLES, StudyParts
 from shapespace.report.pages.write_html import require_report_extra
@@ -99,9 +100,11 @@ def _draw(names: Mapping[str, str], kind: str, shown: object, options: Mapping[s
 
 def html_of_model(model: ShapeModel) -> str:
     """Return a model for a notebook: its first modes, training data, and licence."""
+    counts = part_counts(model)
     rows = [
         ("Made of", training_text(model)),
         ("Surface", f"{model.n_vertices:,} vertices, {0 if model.faces is None else len(model.faces):,} triangles"),
+        *([("Parts", listed([f"{name} {count:,}" for name, count in counts.items()]))] if counts else []),
         ("Modes", f"{model.n_modes}, with {100 * float(model.cumulative_variance[-1]):.1f} % of the variance"),
         (
             "Variance",

@@ -11,6 +11,7 @@ from threading import Lock
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.geometry.mirror_plane import FLIP
@@ -26,6 +27,7 @@ from shapespace.report.inputs.correspondence_folder import (
     scan_status,
 )
 from shapespace.report.inputs.saved_fits import ScanNotFoundError
+from shapespace.report.inputs.subject_parts import Parts
 from shapespace.report.render.scene import bounded_scan, decimate, pack, quantise
 from shapespace.report.render.thumbnails import SQUARES, checker_places, mean_at_vertices
 from shapespace.types import FloatArray
@@ -71,6 +73,7 @@ class Surfaces:
             "corresponding": len(self._corresponded.corresponding),
             "vertices": len(self._corresponded.mean.vertices),
             "rounds": list(run.rounds),
+            "parts": list(run.parts),
             "page": max(1, min(_PAGE, page)),
             "is_large": len(self._corresponded.corresponding) * len(self._corresponded.mean.vertices) > _LARGE,
             "most_marked": MAX_MARKED,
@@ -91,12 +94,14 @@ class Surfaces:
         along, across = checker_places(mean)
         drawn, kept = decimate(mean, _MOST_DRAWN)
         turning, kept_turning = decimate(drawn, _MOST_TURNING)
-        arrays = {
+        arrays: dict[str, npt.NDArray[Any]] = {
             "positions": mean.vertices,
             "faces": np.asarray(kept[faces_of(drawn)], dtype=np.uint32),
             "draft": np.asarray(kept[kept_turning][faces_of(turning)], dtype=np.uint32),
             "places": np.stack([along, across], axis=1),
         }
+        if (parts := Parts.of_counts(self._corresponded.run.parts)) is not None:
+            arrays["parts"] = parts.labels
         return pack(arrays, {"turn": self._corresponded.turn.tolist()})
 
     def packed_population(self) -> bytes:

@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from threading import Lock
@@ -29,6 +30,7 @@ from shapespace.report.inputs.saved_fits import (
     saved_surfaces,
     staged_fit,
 )
+from shapespace.report.inputs.subject_parts import Parts
 from shapespace.report.render.scene import pack_fit, pack_model, pack_surfaces
 from shapespace.schemas import FIT_AGAIN, FitRecord, to_json
 from shapespace.store.manifest import Manifest
@@ -178,13 +180,14 @@ class ModelView:
         fit = self.fits()[name]
         if not self._is_of_this_model(fit):
             raise InputError(f"{name} was fitted by another model; give that one with --model.")
+        parts = Parts.of(self.model)
         with _as_damaged(name):
             try:
-                return pack_fit(staged_fit(self.folder, fit), most_sent=MAX_TRIANGLES)
+                return pack_fit(replace(staged_fit(self.folder, fit), parts=parts), most_sent=MAX_TRIANGLES)
             except ScanNotFoundError as error:
                 surfaces = saved_surfaces(self.folder, fit)
                 return pack_surfaces(
-                    surfaces, fit.record, name=fit.name, label=fit.label, reason=self.public(str(error))
+                    surfaces, fit.record, name=fit.name, label=fit.label, reason=self.public(str(error)), parts=parts
                 )
 
     def _is_of_this_model(self, fit: SavedFit) -> bool:

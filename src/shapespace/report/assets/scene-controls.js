@@ -32,6 +32,7 @@
       }
       const distance = view._camera.distance();
       for (let v = 0; v < p.length / 3; v++) {
+        if (thing.bad?.has(v)) continue;
         const point = [p[3 * v], p[3 * v + 1], p[3 * v + 2]];
         const [px, py, depth] = view.project(point);
         const reach = thing.isMarks ? 12 : 9;

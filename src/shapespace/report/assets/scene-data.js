@@ -79,26 +79,36 @@
     return bytes.buffer;
   };
 
-  /** Surfaces from coefficients in standard deviations: mean + modes z. What moved since the last call is added. */
+  /**
+   * Surfaces from coefficients in standard deviations: mean + modes z; of several parts with relative poses, these are
+   * tangent vertices, from which the surface is composed. What moved since the last call is added.
+   */
   Shapespace.Model = class {
     constructor(unpacked) {
-      const { mean, faces, modes } = unpacked.arrays;
-      this.mean = mean;
+      const { mean, faces, modes, template, parts = null } = unpacked.arrays, { joints = null } = unpacked.facts;
       this.faces = faces && faces.length ? faces : null;
+      this.parts = parts; // number of the part of each vertex
       this.V = mean.length / 3;
       this.K = modes ? modes.shape[0] : 0;
       this._modes = [];
       for (let k = 0; k < this.K; k++) this._modes.push(modes.subarray(k * mean.length, (k + 1) * mean.length));
       this._offset = new Float64Array(mean.length);
       this._z = new Float64Array(this.K);
+      if (joints) {
+        this.articulation = new Shapespace.sceneParts.Articulation(template, parts, joints);
+        for (let i = 0; i < mean.length; i++) this._offset[i] = mean[i] - template[i];
+      }
+      this.mean = joints ? Float32Array.from(this._offsets([]), (off, i) => off + template[i]) : mean;
+      this._from = joints ? template : mean;
     }
 
-    /** One mode's displacement of one standard deviation, Float32Array(3V), mm. */
+    /** One mode's displacement of one standard deviation, Float32Array(3V), mm; of tangent vertices if there are some. */
     mode(k) {
       return this._modes[k];
     }
 
-    _moveTo(z) {
+    /** Displacements at coefficients z, from the mean or the template; moves: see `Articulation.vertices`. */
+    _offsets(z, moves) {
       for (let k = 0; k < this.K; k++) {
         const wanted = k < z.length && Number.isFinite(z[k]) ? z[k] : 0;
         const step = wanted - this._z[k];
@@ -107,20 +117,21 @@
         for (let i = 0; i < offset.length; i++) offset[i] += step * mode[i];
         this._z[k] = wanted;
       }
+      if (!this.articulation) return this._offset;
+      const { template } = this.articulation;
+      return this.articulation.vertices(this._offset, moves).map((value, i) => value - template[i]);
     }
 
-    vertices(z, out) {
-      this._moveTo(z);
-      const to = out || new Float32Array(this.mean.length);
-      const mean = this.mean, offset = this._offset;
-      for (let i = 0; i < to.length; i++) to[i] = mean[i] + offset[i];
+    vertices(z, out, moves) {
+      const offset = this._offsets(z, moves), to = out || new Float32Array(offset.length), from = this._from;
+      for (let i = 0; i < to.length; i++) to[i] = from[i] + offset[i];
       return to;
     }
 
-    /** How far each vertex moves along the normal of the mean, outwards positive, mm. */
-    displacement(z) {
-      this._moveTo(z);
-      const out = new Float32Array(this.V), offset = this._offset;
+    /** How far each vertex moves along the normal of the mean, outwards positive, from z = `from` to `z`, mm. */
+    displacement(z, from = [], moves) {
+      const start = Float64Array.from(this._offsets(from, moves)), offset = this._offsets(z, moves).map((value, i) => value - start[i]);
+      const out = new Float32Array(this.V);
       if (!this.faces) {
         for (let v = 0, i = 0; v < this.V; v++, i += 3) out[v] = Math.hypot(offset[i], offset[i + 1], offset[i + 2]);
         return out;

@@ -24,7 +24,7 @@
     uniform vec2 range; uniform float threshold; uniform int paint; uniform float squares;
     vec3 painted(vec2 value, vec3 own) {
       if (paint == 0) return colour;
-      if (paint == 2) return own;
+      if (paint == 2 || paint == 4) return own; // 4: the colour of the part, lit as a plain one
       if (paint == 3) {
         // As render.squares: every other one is paper, the others take turns so that near ones differ.
         vec2 at = floor(value);
@@ -53,7 +53,7 @@
       vec3 n = normalize(vNormal);
       float back = gl_FrontFacing ? 0.0 : 1.0;
       if (back > 0.5) n = -n;
-      gl_FragColor = vec4(lit(painted(vValue, vOwn), n, back, paint == 0 ? 0.0 : paint == 3 ? 0.4 : 1.0), opacity);
+      gl_FragColor = vec4(lit(painted(vValue, vOwn), n, back, paint == 0 || paint == 4 ? 0.0 : paint == 3 ? 0.4 : 1.0), opacity);
     }`;
 
   const POINT_VERTEX = `

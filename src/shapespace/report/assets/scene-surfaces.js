@@ -3,7 +3,7 @@
   "use strict";
 
   const Shapespace = window.Shapespace;
-  const { normalsOf, material, useMap } = Shapespace.sceneParts;
+  const { normalsOf, material, useMap, explode } = Shapespace.sceneParts;
 
   const GREY = [0.66, 0.66, 0.66];
   const SIGNAL = [0.8, 0.1, 0.45];
@@ -17,22 +17,23 @@
       this._things = new Map();
       this._marks = new Map();
       this._texts = new Map();
+      this._arrangement = { hidden: new Set(), apart: 0 };
       if (works) this._scene = new THREE.Scene();
     }
 
     /**
      * Show a surface, or points where faces is null; positions Float32Array(3V), faces Uint32Array(3F). draft: fewer
-     * triangles between some of the same vertices, drawn while the surface moves where the processor draws.
+     * triangles between some of the same vertices, drawn while the surface moves where the processor draws. parts: number
+     * of the part of each vertex, if there are several, which have colours of their own, see `arrange`.
      */
-    setSurface(id, { positions, faces = null, draft = null, colour = CLAY, opacity = 1, visible = true, size = null }) {
+    setSurface(id, { positions, faces = null, draft = null, parts = null, colour = CLAY, opacity = 1, visible = true, size = null }) {
       if (!this.works) return;
       this.remove(id);
-      const thing = { id, colour, opacity, visible, faces: null, given: { faces, draft }, positions, paint: null, size };
+      const thing = { id, colour, opacity, visible, faces: null, given: { faces, draft, parts }, positions, paint: null, size };
       const geometry = new THREE.BufferGeometry();
-      const known = new Float32Array(positions);
-      const bad = replaceUnknown(known);
+      const known = new Float32Array(this._apart(positions, parts));
+      const bad = (thing.bad = withHidden(replaceUnknown(known), parts, this._arrangement.hidden));
       thing.faces = faces && faces.length ? usable(faces, known.length / 3, bad) : null;
-      thing.positions = known;
       geometry.setAttribute("position", dynamic(known, 3));
       geometry.setAttribute("value", dynamic(new Float32Array((2 * known.length) / 3), 2));
       geometry.setAttribute("own", new THREE.BufferAttribute(new Uint8Array(known.length), 3, true));
@@ -57,6 +58,32 @@
       this._scene.add(thing.object);
       this._things.set(id, thing);
       this.set(id, {});
+      this.paint(id, null);
+    }
+
+    _apart(positions, parts) {
+      return parts && this._arrangement.apart ? explode(positions, parts, this._arrangement.apart) : positions;
+    }
+
+    /** Where the vertices of a surface are drawn, not-a-number where its part is hidden. */
+    placed(id, positions) {
+      const parts = this._things.get(id)?.given.parts, { hidden } = this._arrangement, shown = this._apart(positions, parts);
+      return parts && hidden.size ? shown.map((value, i) => (hidden.has(parts[Math.floor(i / 3)]) ? NaN : value)) : shown;
+    }
+
+    /** Hide the parts whose numbers are in `hidden`, and move parts apart by a multiple of their distances from the middle. */
+    arrange({ hidden, apart }) {
+      const moves = apart !== this._arrangement.apart;
+      this._arrangement = { hidden: new Set(hidden), apart };
+      for (const thing of Array.from(this._things.values())) if (thing.given?.parts) this._setAgain(thing, thing.positions);
+      if (moves) this.refit();
+    }
+
+    /** Show a surface again at other positions, as it was. */
+    _setAgain({ id, colour, opacity, visible, given, paint, size }, positions) {
+      this.setSurface(id, { positions, ...given, colour, opacity, visible, size });
+      const each = paint && paint.options.squares ? 2 : 1;
+      if (paint && paint.values.length === (each * positions.length) / 3) this.paint(id, paint.values, paint.options);
     }
 
     /** Move the vertices of a surface; triangles and paint stay. */
@@ -64,16 +91,12 @@
       const thing = this._things.get(id);
       if (!thing) return;
       const attribute = thing.object.geometry.attributes.position;
+      const shown = this._apart(positions, thing.given.parts);
       let sum = 0;
-      for (let i = 0; i < positions.length; i++) sum += positions[i];
-      if (positions.length !== attribute.array.length || !Number.isFinite(sum)) {
-        const { colour, opacity, visible, given, paint, size } = thing;
-        this.setSurface(id, { positions, ...given, colour, opacity, visible, size });
-        const each = paint && paint.options.squares ? 2 : 1;
-        if (paint && paint.values.length === (each * positions.length) / 3) this.paint(id, paint.values, paint.options);
-        return;
-      }
-      attribute.array.set(positions);
+      for (let i = 0; i < shown.length; i++) sum += shown[i];
+      if (shown.length !== attribute.array.length || !Number.isFinite(sum)) return this._setAgain(thing, positions);
+      thing.positions = positions;
+      attribute.array.set(shown);
       attribute.needsUpdate = true;
       if (thing.faces) {
         normalsOf(attribute.array, thing.faces, thing.object.geometry.attributes.normal.array);
@@ -94,6 +117,12 @@
       if (!values) {
         thing.paint = null;
         uniforms.paint.value = 0;
+        if (thing.given?.parts) {
+          const { own } = thing.object.geometry.attributes, bytes = Shapespace.colours.parts.map((colour) => colour.map((c) => Math.round(255 * c)));
+          thing.given.parts.forEach((part, v) => own.array.set(bytes[part % bytes.length], 3 * v));
+          own.needsUpdate = true;
+          uniforms.paint.value = 4;
+        }
         this.request();
         return;
       }
@@ -232,6 +261,14 @@
     }
     if (bad) for (const v of bad) positions.fill(0, 3 * v, 3 * v + 3);
     return bad;
+  }
+
+  /** The set of vertices that are not drawn, with those of hidden parts, or null. */
+  function withHidden(bad, parts, hidden) {
+    if (!parts || !hidden.size) return bad;
+    const all = bad || new Set();
+    parts.forEach((part, v) => { if (hidden.has(part)) all.add(v); });
+    return all;
   }
 
   /** The triangles whose three vertices exist and are finite. */

@@ -85,7 +85,23 @@
 
     /** Go to where all that is visible, or the given ids, fills the picture from the front, or `turned` from any side; margin 1.1 leaves more. */
     frame(ids, margin = 1, turned = false) {
-      if (!this.works) return;
+      if (!this._enclose(ids, margin, turned)) return;
+      Object.assign(this._camera.state, { yaw: 0, pitch: 0, roll: 0, zoom: 1 });
+      this._camera.home = copyCamera(this._camera.state);
+      this._moved();
+    }
+
+    /** Enclose what `frame` did, which is larger or smaller now, from where the camera is. */
+    refit() {
+      if (!this._framed || !this._enclose(...this._framed)) return;
+      const { target, extent } = copyCamera(this._camera.state);
+      Object.assign(this._camera.home, { target, extent });
+      this._moved();
+    }
+
+    /** Put target and extent of the camera on what is visible; return whether there is something. */
+    _enclose(ids, margin, turned) {
+      if (!this.works) return false;
       const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
       for (const thing of this._things.values()) {
         if (ids ? !ids.includes(thing.id) : !thing.visible || thing.isMarks) continue;
@@ -96,14 +112,13 @@
           if (p[i] > high[axis]) high[axis] = p[i];
         }
       }
-      if (!(low[0] <= high[0])) return;
+      if (!(low[0] <= high[0])) return false;
+      this._framed = [ids, margin, turned];
       const { state } = this._camera;
       state.target = low.map((value, axis) => (value + high[axis]) / 2);
       state.extent = low.map((value, axis) => Math.max((high[axis] - value) * margin, 1e-3));
       if (turned) state.extent.fill(Math.max(...state.extent));
-      Object.assign(state, { yaw: 0, pitch: 0, roll: 0, zoom: 1 });
-      this._camera.home = copyCamera(state);
-      this._moved();
+      return true;
     }
 
     get camera() {

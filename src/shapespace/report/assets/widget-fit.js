@@ -44,7 +44,7 @@
       if (stage.take(draw) && arrays.scan) stage.a.setSurface("scan", { positions: arrays.scan, faces: arrays.scan_faces || null, colour: colours().scan });
       if (other) other.remove("model");
       if (view.has("model")) view.move("model", positions);
-      else view.setSurface("model", { positions, faces: arrays.faces || null, colour: colours().model });
+      else view.setSurface("model", { positions, faces: arrays.faces || null, parts: arrays.parts || null, colour: colours().model });
       if (scan) stage.a.set("scan", scan.shown());
       view.set("model", model.shown());
       paint(view);
@@ -71,7 +71,7 @@
       if (arrays.scan) stage.a.paint("scan", ...(state.colour === "scan" ? [values, options] : state.colour === "colour" ? [arrays.scan_colours, { rgb: true }] : [null]));
       stage.bar(scale && { ...scale, keys: [...(state.marked ? [["beyond the threshold", signal]] : []), ...scale.keys] });
       const both = arrays.scan && !isSide();
-      if (state.colour === "plain") stage.legend(both ? [["scan", ofScan], ["model", ofModel]] : null, "the nearer one is shown");
+      if (state.colour === "plain") stage.legend(both ? [["scan", ofScan], ...(arrays.parts ? [] : [["model", ofModel]])] : null, "the nearer one is shown");
       else if (state.colour === "regions") stage.legend(Object.entries(REGIONS).map(([name, text]) => [text, regions[name]]));
       else if (state.colour === "colour") stage.legend([["the fit does not follow the scan", unknown]]);
       else stage.legend(null);
@@ -106,7 +106,7 @@
         draw();
       } });
       row.row.classList.add("ss-layer");
-      row.row.prepend(box, dot(colours()[id]));
+      row.row.prepend(box, id === "model" && arrays.parts ? make("span") : dot(colours()[id]));
       return {
         row: row.row,
         shown: () => ({ visible: box.checked, opacity: row.get() / 100 }),

@@ -4,7 +4,7 @@
 
   const Shapespace = window.Shapespace;
   const parts = Shapespace.widgetParts;
-  const { make, signed, percent, slider, button, animation, swing, tick, niceCeiling, quantile, displacementScale, staged } = parts;
+  const { make, signed, percent, slider, button, animation, swing, tick, choice, niceCeiling, quantile, displacementScale, staged } = parts;
 
   const REACH = 3; // standard deviations
   const SHOWN_AT_FIRST = 12; // modes
@@ -16,19 +16,22 @@
   /** Position of a landmark: `at` has the vertices of its triangle and their barycentric weights. */
   const onSurface = (positions, at) => [0, 1, 2].map((axis) => at.vertices.reduce((sum, v, k) => sum + at.weights[k] * positions[3 * v + axis], 0));
 
+  const MOVES = { both: "Shape and pose", shape: "Shape only", pose: "Pose only" };
+
   /** Sliders that move `model` along its modes; z: the coefficients, standard deviations; onchange(): they were changed by hand. */
   parts.modes = function ({ facts, arrays }, { stage, controls, model, z, onchange = () => {} }) {
-    let positions, top = 0;
+    let positions, top = 0, moves = "both";
     const on = { map: false, landmarks: false };
     const draw = () => {
-      positions = model.vertices(z, positions);
-      stage.show(draw, { positions, faces: model.faces });
-      stage.captions(z.some((value) => value) ? "" : "The mean shape");
-      const moved = on.map ? model.displacement(z) : null, most = moved ? quantile(moved, 0.98) : 0;
+      positions = model.vertices(z, positions, moves);
+      stage.show(draw, { positions, faces: model.faces, parts: model.parts });
+      stage.captions(!z.some((value) => value) ? "The mean shape" : moves === "both" ? "" : MOVES[moves]);
+      const moved = on.map ? model.displacement(z, [], moves) : null, most = moved ? quantile(moved, 0.98) : 0;
       if (moved && (most > top || most < top / 4)) top = niceCeiling(most);
       stage.paint(moved, displacementScale(model, top, "from the mean"));
       const marks = on.landmarks ? Object.entries(facts.landmarks) : [];
-      stage.a.marks("landmarks", marks.map(([label, at]) => ({ position: onSurface(positions, at), label })));
+      const placed = stage.a.placed("model", positions);
+      stage.a.marks("landmarks", marks.map(([label, at]) => ({ position: onSurface(placed, at), label })).filter(({ position }) => position.every(Number.isFinite)));
     };
     const act = (change) => () => {
       stop();
@@ -91,6 +94,10 @@
       make("div", { class: "ss-buttons" },
         button("Mean shape", act(() => setShape([])), { "data-testid": "reset-all" }),
         button("Random shape", act(() => setShape(parts.randomShape(z.length))), { "data-testid": "random" }), toggle),
+      model.articulation ? choice("Modes move", Object.entries(MOVES), moves, (key) => {
+        moves = key;
+        draw();
+      }, "moves").row : "",
       make("p", { class: "ss-hint", text: "Each slider is one mode with its share of the variance, in standard deviations. Animate swings the modes that are ticked." }),
       make("div", { class: "ss-buttons" }, option("map", "Colour by distance from the mean"), Object.keys(facts.landmarks).length ? option("landmarks", "Landmarks") : null),
       make("div", { class: "ss-sliders", role: "group", "aria-label": "Modes, in standard deviations", "data-testid": "sliders" }, ...rows.map(({ row }) => row), more)
@@ -116,16 +123,13 @@
     /** Draw the shape; isNew: from other ends. */
     const draw = (isNew) => {
       positions = model.vertices(at(now), positions);
-      stage.show(draw, { positions, faces: model.faces });
+      stage.show(draw, { positions, faces: model.faces, parts: model.parts });
       stage.captions(words(now));
       if (isNew) {
         change = null;
         row.put(now);
       }
-      if (isColoured && !change) {
-        const from = at(-1);
-        change = model.displacement(at(1).map((value, k) => value - from[k]));
-      }
+      if (isColoured && !change) change = model.displacement(at(1), at(-1));
       const top = change ? niceCeiling(quantile(change, 0.98)) : 0;
       stage.paint(isColoured ? change : null, displacementScale(model, top, "from one end to the other"));
     };

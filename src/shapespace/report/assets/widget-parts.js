@@ -122,6 +122,28 @@
     return { row, put };
   }
 
+  /** Parts in their colours, to be shown, hidden and moved apart in views(); changed(): called after. */
+  function partControls(names, views, changed) {
+    const arrangement = { hidden: new Set(), apart: 0 };
+    const arrange = () => {
+      views().forEach((view) => view.arrange(arrangement));
+      changed();
+    };
+    const boxes = names.map((name, part) => {
+      const row = tick(name, true, (isShown) => {
+        arrangement.hidden[isShown ? "delete" : "add"](part);
+        arrange();
+      }, `part-${name}`);
+      row.children[0].after(dot(Shapespace.colours.parts[part % Shapespace.colours.parts.length]));
+      return row;
+    });
+    const apart = slider({ label: "Exploded", min: 0, max: 100, step: 5, value: 0, show: (value) => `${value} %`, testid: "exploded", input: (value) => {
+      arrangement.apart = value / 100;
+      arrange();
+    } });
+    return { element: make("div", { class: "ss-parts", role: "group", "aria-label": "Parts", "data-testid": "parts" }, ...boxes, apart.row), arrangement };
+  }
+
   const swatches = (entries) => make("ul", { class: "ss-swatches" }, ...entries.map(([text, colour]) => make("li", {}, dot(colour), make("span", { text }))));
 
   /** The next round number that is not below value. */
@@ -186,7 +208,7 @@
 
   Shapespace.widgets = {};
   Shapespace.widgetParts = {
-    colours: () => Shapespace.colours, make, signed, percent, css, dot, slider, button, animation, swing, tick, select, choice, swatches,
+    colours: () => Shapespace.colours, make, signed, percent, css, dot, slider, button, animation, swing, tick, select, choice, swatches, partControls,
     niceCeiling, quantile, displacementScale, widget,
   };
 })();

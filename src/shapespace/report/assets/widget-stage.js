@@ -3,7 +3,7 @@
   "use strict";
 
   const Shapespace = window.Shapespace;
-  const { make, dot, widget } = Shapespace.widgetParts;
+  const { make, dot, partControls, widget } = Shapespace.widgetParts;
 
   /** Pictures in `element`, which it fills; embedded: see `Shapespace.View`. Views and surfaces belong to the owner that `show` was last called by. */
   class Stage {
@@ -17,6 +17,7 @@
       this.element = make("div", { class: "ss-stage" }, this.panes, this._bar, this._legend, this._empty);
       element.append(this.element);
       this._captions = [];
+      this._arrangement = null;
       this.b = null;
       this.a = this._view("view");
     }
@@ -25,7 +26,17 @@
       const plate = make("div", { class: "ss-plate", "data-testid": testid }), caption = make("p", { class: "ss-caption" });
       this._captions.push(caption);
       this.panes.append(make("div", { class: "ss-pane" }, plate, caption));
-      return new Shapespace.View(plate, { label: "The shape in 3-D", embedded: this._embedded });
+      const view = new Shapespace.View(plate, { label: "The shape in 3-D", embedded: this._embedded });
+      if (this._arrangement) view.arrange(this._arrangement);
+      return view;
+    }
+
+    /** Add controls of the parts of all surfaces, by their names; none if there are no parts. */
+    setParts(names) {
+      if (!names) return;
+      const { element, arrangement } = partControls(names, () => [this.a, this.b].filter(Boolean), () => this._owner?.());
+      this._arrangement = arrangement;
+      this.element.prepend(element);
     }
 
     /** Whether there are two views; the second one is made when it is first needed. */
@@ -104,6 +115,7 @@
   const staged = (build) => widget((unpacked, element) => {
     const stage = new Stage(element), controls = make("div", { class: "ss-controls" });
     element.append(controls);
+    stage.setParts(unpacked.facts.parts);
     return { view: stage.a, ...build(unpacked, { stage, controls }) };
   });
 

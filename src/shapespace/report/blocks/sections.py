@@ -59,6 +59,7 @@ from shapespace.report.inputs.saved_fits import (
     StagedFit,
     measured_mm,
 )
+from shapespace.report.inputs.subject_parts import JointSpread, Parts, part_counts, relative_pose
 from shapespace.report.pages.page import OrderedPicture, Page
 from shapespace.report.render import thumbnails
 from shapespace.report.render.scene import pack_fit, pack_model, pack_scatter, pack_surfaces
@@ -135,6 +136,7 @@ def model_part(page: Page, model: ShapeModel, *, figure_of: str = "", to_move: i
     return [
         modes_to_move(page, model, to_move),
         Facts(rows, "The shape model"),
+        *_parts_of_model(model),
         Folded(
             "Its modes as stills, their variance, the mean from three sides",
             [
@@ -162,6 +164,37 @@ def model_part(page: Page, model: ShapeModel, *, figure_of: str = "", to_move: i
             ],
         ),
     ]
+
+
+_RELATIVE_POSE = {
+    "modelled": "modes move shapes and relative poses, with exact rotations",
+    "kept": "modes move the vertices of all parts in one frame, linearly",
+    "removed": "modes move the shapes of the parts; their relative pose is that of the mean",
+}
+
+
+def _parts_of_model(model: ShapeModel) -> list[Block]:
+    """Return the parts of a model, and the spread of their relative poses; nothing if it has one structure."""
+    if (pose := relative_pose(model)) is None:
+        return []
+    of_joints = {joint.part: joint for joint in pose.joints}
+    rows = [
+        [Cell(name), Cell(f"{count:,}", count), *_cells_of_joint(of_joints.get(name))]
+        for name, count in part_counts(model).items()
+    ]
+    columns = [
+        Head("Part"), Head("Vertices", "number"), Head("Joint with"), Head("Rotation, SD in degrees", "number"),
+        Head("Translation, SD in mm", "number"),
+    ]  # fmt: skip
+    order = ", to first order" if pose.choice == "kept" else ""
+    text = f"Relative pose {pose.choice}: {_RELATIVE_POSE[pose.choice]}."
+    return [Table(columns, rows, f"The parts. {text} Standard deviations (SD) are those of the modes{order}.")]
+
+
+def _cells_of_joint(joint: JointSpread | None) -> list[Cell]:
+    if joint is None:
+        return [Cell(DASH), Cell(DASH), Cell(DASH)]
+    return [Cell(joint.parent), number(joint.rotation_deg, 1), number(joint.translation_mm, 1)]
 
 
 def order_model(page: Page, model: ShapeModel) -> Mapping[str, OrderedPicture]:
@@ -195,7 +228,7 @@ def quality_part(page: Page, folder: Folder) -> Figure:
 def modes_to_move(page: Page, model: ShapeModel, most: int) -> Turning | Figure:
     """Return the model's modes with sliders, and a still of the mean as the fallback."""
     count = min(most, model.n_modes)
-    still = thumbnails.mesh_still(model.mesh(), (420, 420))
+    still = thumbnails.mesh_still(model.mesh(), (420, 420), Parts.of(model))
     which = f"The first {counted(count, 'mode')} of {model.n_modes}"
     if count == model.n_modes:
         which = f"{'Its' if count == 1 else 'All'} {counted(count, 'mode')}"
@@ -261,7 +294,9 @@ def fit_to_turn(page: Page, fit: StagedFit) -> Turning | Figure:
     )
 
 
-def surface_to_turn(page: Page, fit: SavedFit, surfaces: Mapping[str, Mesh], why: str) -> Turning | Figure:
+def surface_to_turn(
+    page: Page, fit: SavedFit, surfaces: Mapping[str, Mesh], why: str, parts: Parts | None = None
+) -> Turning | Figure:
     """Return the fitted surface of a fit whose scan cannot be shown, with a still image as the fallback.
 
     Args:
@@ -269,11 +304,14 @@ def surface_to_turn(page: Page, fit: SavedFit, surfaces: Mapping[str, Mesh], why
         fit: fit of the surface.
         surfaces: `final`, and if the fit has one, `dense`, in the picture frame.
         why: reason why the scan is not shown, as the end of a sentence.
+        parts: parts of the model; None if it has one structure, or is not known.
     """
     return page.turning(
         "fit",
-        pack_surfaces(surfaces, fit.record, name=fit.name, label=fit.label, reason=why, largest=SCAN_TRIANGLES),
-        page.image(thumbnails.mesh_still(surfaces["final"], (420, 420)), f"The fitted surface of {fit.name}"),
+        pack_surfaces(
+            surfaces, fit.record, name=fit.name, label=fit.label, reason=why, largest=SCAN_TRIANGLES, parts=parts
+        ),
+        page.image(thumbnails.mesh_still(surfaces["final"], (420, 420), parts), f"The fitted surface of {fit.name}"),
         f"{fit.label}: the fitted surface; {why.removesuffix('.')}.",
         label=f"Fitted surface of {fit.label}, to be turned",
         still="The still shows the fitted surface.",

@@ -62,6 +62,7 @@ if TYPE_CHECKING:
         mean_figure,
         mode_animation,
         modes_figure,
+        parts_figure,
         quality_figure,
         spectrum_figure,
     )
@@ -119,6 +120,7 @@ __all__ = [
     "oriented",
     "over_time_figure",
     "overlay_figure",
+    "parts_figure",
     "portrait_figure",
     "position_std_figure",
     "publication_style",
@@ -181,6 +183,7 @@ __getattr__, __dir__ = lazy_names(
         ),
         "report.figures.model_figures": (
             "mean_figure",
+            "parts_figure",
             "mode_animation",
             "modes_figure",
             "quality_figure",

@@ -40,8 +40,9 @@ from shapespace.report.figures.draw import (
     view,
 )
 from shapespace.report.inputs.saved_fits import nice_ceiling
-from shapespace.report.render.palette import SEQUENTIAL
-from shapespace.report.render.renderer import Image, Layer, render
+from shapespace.report.inputs.subject_parts import Parts
+from shapespace.report.render.palette import PARTS, SEQUENTIAL, Colour
+from shapespace.report.render.renderer import Image, Layer, part_layer, render
 from shapespace.schemas import BySize, Measured, Quality, read
 from shapespace.types import FloatArray, Mesh
 
@@ -67,20 +68,27 @@ def mean_figure(model: ShapeModel, *, title: str = "") -> Figure:
         model: the shape space.
         title: text above the figure; by default the number of shapes of the mean.
     """
-    mean = model.mesh()
-    layers = [Layer(mean)]
-    if model.landmarks:
-        landmark_positions = model.landmarks.interpolate(mean.vertices)
-        size = 0.008 * float(np.ptp(mean.vertices, axis=0).max())
-        layers.append(Layer(Mesh(landmark_positions), _LANDMARK, point_radius_mm=size))
-    sides = (("front", 0.0), ("three-quarter", 40.0), ("side", 90.0))
-    cameras, size = equal_views([(mean.vertices, yaw) for _, yaw in sides], len(sides))
-    panels = [render(*layers, camera=camera, size=size) for camera in cameras]
     marks = f", with {counted(len(model.landmarks), 'landmark')}" if model.landmarks else ""
-    return grid(
-        [Row(panels, [name for name, _ in sides])],
-        title=title or f"The mean of {counted(model.n_training, 'shape')}{marks}",
+    return parts_figure(
+        model.mesh(), Parts.of(model), title=title or f"The mean of {counted(model.n_training, 'shape')}{marks}"
     )
+
+
+def parts_figure(mesh: Mesh, parts: Parts | None, *, title: str) -> Figure:
+    """Draw a mesh from three sides, in the colours of its parts if it has several, with its landmarks."""
+    layers = [part_layer(mesh, parts and parts.labels)]
+    if mesh.landmarks:
+        size = 0.008 * float(np.ptp(mesh.vertices, axis=0).max())
+        layers.append(Layer(Mesh(np.array(list(mesh.landmarks.values()))), _LANDMARK, point_radius_mm=size))
+    sides = (("front", 0.0), ("three-quarter", 40.0), ("side", 90.0))
+    cameras, size = equal_views([(mesh.vertices, yaw) for _, yaw in sides], len(sides))
+    panels = [render(*layers, camera=camera, size=size) for camera in cameras]
+    return grid([Row(panels, [name for name, _ in sides])], title=title, keys=part_keys(parts))
+
+
+def part_keys(parts: Parts | None) -> list[tuple[str, Colour]]:
+    """Return the names of parts with their colours, for a key; empty if there is one structure."""
+    return [(name, PARTS[k % len(PARTS)]) for k, name in enumerate(parts.names if parts else ())]
 
 
 def modes_figure(model: ShapeModel, modes: int = 5, deviations: float = 3.0, *, title: str = "") -> Figure:
@@ -101,19 +109,18 @@ def modes_figure(model: ShapeModel, modes: int = 5, deviations: float = 3.0, *, 
     if modes < 1 or not deviations > 0:
         raise InputError(f"There is nothing to draw of {modes} modes at {deviations} standard deviations.")
     n_shown = min(modes, model.n_modes)
-    moves = [mode_displacement(model, k, deviations) for k in range(n_shown)]
-    mean = model.mesh()
-    camera_view = view(np.concatenate([mean.vertices + sign * move for move in moves for sign in (-1, 1)]), 4)
-    lengths = [np.linalg.norm(move, axis=1) for move in moves]
+    mean, parts = model.mesh(), Parts.of(model)
+    labels = parts and parts.labels
+    ends = [[model.mesh(b).vertices for b in (-own, own)] for own in np.diag(deviations * model.stddev)[:n_shown]]
+    camera_view = view(np.concatenate([end for both in ends for end in both]), 4)
+    lengths = [np.linalg.norm(high - mean.vertices, axis=1) for _, high in ends]
     top = nice_ceiling(max(float(length.max()) for length in lengths))
-    middle = render(Layer(mean), camera=camera_view.camera, size=camera_view.size)
+    middle = render(part_layer(mean, labels), camera=camera_view.camera, size=camera_view.size)
     rows: list[Row] = []
-    for k, (move, length) in enumerate(zip(moves, lengths, strict=True)):
+    for k, (both, length) in enumerate(zip(ends, lengths, strict=True)):
         low, high = (
-            render(
-                Layer(mean.with_vertices(mean.vertices + sign * move)), camera=camera_view.camera, size=camera_view.size
-            )
-            for sign in (-1, 1)
+            render(part_layer(mean.with_vertices(end), labels), camera=camera_view.camera, size=camera_view.size)
+            for end in both
         )
         displacement = render(
             Layer(mean, scalars=length, colormap=SEQUENTIAL, vmax=top), camera=camera_view.camera, size=camera_view.size
@@ -131,6 +138,7 @@ def modes_figure(model: ShapeModel, modes: int = 5, deviations: float = 3.0, *, 
         rows,
         title=title or f"Effect of {_name_modes(n_shown, model.n_modes)} on the mean",
         scale=Scale(f"how far a point moves at {of_each} (mm)", SEQUENTIAL, 0.0, top),
+        keys=part_keys(parts),
     )
 
 
@@ -183,21 +191,23 @@ def mode_animation(
     """
     if frames < 4 or milliseconds < 1:
         raise InputError(f"An animation needs 4 frames or more of 1 ms or more, not {frames} of {milliseconds} ms.")
-    move = mode_displacement(model, mode, 1.0)
-    mean = model.mesh()
-    camera_view = view(
-        np.concatenate([mean.vertices + sign * deviations * move for sign in (-1, 1)]), 1, yaw_deg=yaw_deg, width=width
-    )
+    ends = [mode_displacement(model, mode, sign * deviations) + model.mean_vertices for sign in (-1, 1)]
+    parts = Parts.of(model)
+    camera_view = view(np.concatenate(ends), 1, yaw_deg=yaw_deg, width=width)
     forth = [
         _draw_label(
             render(
-                Layer(mean.with_vertices(mean.vertices + z * move)), camera=camera_view.camera, size=camera_view.size
+                part_layer(
+                    Mesh(model.mean_vertices + mode_displacement(model, mode, z), model.faces), parts and parts.labels
+                ),
+                camera=camera_view.camera,
+                size=camera_view.size,
             ),
             f"mode {mode + 1}",
-            float(z),
+            z,
             deviations,
         )
-        for z in (deviations * np.sin(np.linspace(-np.pi / 2, np.pi / 2, (frames // 2) + 1)))
+        for z in (deviations * np.sin(np.linspace(-np.pi / 2, np.pi / 2, (frames // 2) + 1))).tolist()
     ]
     cycle = forth + forth[-2:0:-1]
     stream = io.BytesIO()

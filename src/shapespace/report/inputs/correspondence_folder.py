@@ -101,6 +101,10 @@ class Corresponded:
         self._mean = self.folder.mesh(CorrespondenceRecord.MEAN)
         if self._mean.faces is None or not np.isfinite(self._mean.vertices).all():
             raise FileFormatError(f"{CorrespondenceRecord.MEAN} is not a complete surface; {CORRESPOND_AGAIN}.")
+        if self.run.parts and sum(self.run.parts.values()) != len(self._mean.vertices):
+            raise FileFormatError(
+                f"{summary}: its parts do not have the vertices of the mean shape; {CORRESPOND_AGAIN}."
+            )
         self.unread: dict[str, str] = {}
         self.records = {record.name: record for record in map(self._record, self._record_files()) if record is not None}
         self.turn = np.eye(3)

@@ -10,7 +10,7 @@ import os
 import shlex
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, TypeAlias, cast
@@ -32,6 +32,7 @@ from shapespace.io.meshes.mesh_io import read_mesh
 from shapespace.io.tables.table_io import table_rows
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report.blocks.wording import counted, known, printable
+from shapespace.report.inputs.subject_parts import Parts
 from shapespace.schemas import FitEntry, FitRecord
 from shapespace.store.results import ENDING, ENDINGS, Results, arrays_at, json_at, mesh_at, results_at
 from shapespace.types import FloatArray, IntArray, Mesh, Similarity
@@ -479,6 +480,7 @@ class StagedFit:
         b_stddev: (K,) mm.
         shrinkage: (K,) in [0, 1].
         history: the iterations, in order; empty if the stages were not saved.
+        parts: parts of the model; None if it has one structure, or is not known.
     """
 
     name: str
@@ -495,6 +497,7 @@ class StagedFit:
     b_stddev: FloatArray
     shrinkage: FloatArray
     history: tuple[Moment, ...]
+    parts: Parts | None = None
 
     @cached_property
     def scale_mm(self) -> float:
@@ -512,9 +515,10 @@ class StagedFit:
     @staticmethod
     def of(model: ShapeModel, result: FitResult, label: str = "") -> StagedFit:
         """Return the staged fit of `result`, which was fitted by `model`."""
-        return StagedFit.from_arrays(
+        staged = StagedFit.from_arrays(
             stage_arrays(result, model), result, name=result.scan_name, label=label or result.scan_name
         )
+        return replace(staged, parts=Parts.of(model))
 
     @staticmethod
     def from_surfaces(
@@ -561,6 +565,7 @@ class StagedFit:
             regions=None,
             **known,
             history=(),
+            parts=None,
         )
 
     @staticmethod
@@ -631,6 +636,7 @@ class StagedFit:
             regions=regions,
             **known,
             history=history,
+            parts=None,
         )
 
 

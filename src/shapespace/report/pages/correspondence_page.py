@@ -54,6 +54,7 @@ from shapespace.report.inputs.correspondence_folder import (
     upright,
 )
 from shapespace.report.inputs.saved_fits import Folder, nice_ceiling
+from shapespace.report.inputs.subject_parts import Parts
 from shapespace.report.pages.page import Chapter, Page
 from shapespace.report.render import thumbnails
 from shapespace.report.render.palette import DIVERGING, SEQUENTIAL
@@ -267,6 +268,14 @@ class CorrespondencePage:
         )  # fmt: skip
         surfaces, labels = [placed[r.name].vertices for r in pictured], [record.name for record in pictured]
         pictures: list[Block] = []
+        if (parts := Parts.of_counts(self.result.run.parts)) is not None:
+            pictures.append(
+                self.page.figure(
+                    figures.parts_figure(self.mean, parts, title="The parts of the mean shape"),
+                    f"The parts: {listed([f'{name}, {n:,} vertices' for name, n in self.result.run.parts.items()])}.",
+                    alt="The parts of the mean shape in their colours, from three sides",
+                )
+            )
         for yaw, side in ((0.0, "from the front"), (figures.SIDE_DEG, "from one side")):
             drawn = figures.checkerboard_figure(
                 self.mean, surfaces, labels, yaw_deg=yaw, title=f"The same squares on every scan, {side}"

@@ -68,6 +68,7 @@ from shapespace.report.inputs.saved_fits import (
     saved_surfaces,
     staged_fit,
 )
+from shapespace.report.inputs.subject_parts import Parts
 from shapespace.report.pages import study_page
 from shapespace.report.pages.page import Chapter, Page
 from shapespace.report.render import thumbnails
@@ -141,7 +142,14 @@ class FolderPage:
 
     def staged(self, fit: SavedFit) -> StagedFit:
         """Return the data for pictures of `fit`, labelled with its name."""
-        return self.page.once(fit, lambda: replace(staged_fit(self.folder, fit), label=fit.name))
+        return self.page.once(fit, lambda: replace(staged_fit(self.folder, fit), label=fit.name, parts=self.parts(fit)))
+
+    def parts(self, fit: SavedFit) -> Parts | None:
+        """Return the parts of the model of `fit`; None if it has one structure, or cannot be read."""
+        with suppress(ShapespaceError):
+            model = self.model()
+            return Parts.of(model) if model.content_hash == fit.record.model.hash else None
+        return None
 
     # The page
 
@@ -533,7 +541,7 @@ class FolderPage:
             why, surfaces = str(error), saved_surfaces(self.folder, fit)
             return [
                 *sections.fit_facts(fit),
-                *self.page.tried(lambda: sections.surface_to_turn(self.page, fit, surfaces, why)),
+                *self.page.tried(lambda: sections.surface_to_turn(self.page, fit, surfaces, why, self.parts(fit))),
             ]
         reserve = _RESERVE_BYTES + study_page.SECTION_BYTES * min(self.recognised + len(self.analyses), _MOST_RESERVED)
         return [

@@ -54,6 +54,12 @@ CATEGORIES: tuple[Colour, ...] = (
     (0.420, 0.080, 0.060),
 )
 
+PARTS: tuple[Colour, ...] = tuple(
+    (int(name[:2], 16) / 255, int(name[2:4], 16) / 255, int(name[4:], 16) / 255)
+    for name in ("77aadd", "eedd88", "ee6677", "228833", "aa3377", "bbbbbb", "99ddff", "cc79a7")
+)
+"""Colours of the parts of one subject, of Tol and of Okabe and Ito, in an order that keeps the first ones far apart."""
+
 _TO_CONES = np.array(
     [
         [0.4122214708, 0.5363325363, 0.0514459929],

@@ -18,7 +18,7 @@ from shapespace.compiled import compiled
 from shapespace.errors import InputError
 from shapespace.geometry.normals import vertex_normals
 from shapespace.io.memory_cache import cached_with_owner
-from shapespace.report.render.palette import CLAY, DIVERGING, SEQUENTIAL, UNKNOWN_COLOUR, Colour
+from shapespace.report.render.palette import CLAY, DIVERGING, PARTS, SEQUENTIAL, UNKNOWN_COLOUR, Colour
 from shapespace.types import FloatArray, IntArray, Mesh, read_only
 
 Image: TypeAlias = npt.NDArray[np.uint8]
@@ -164,6 +164,22 @@ def distance_layer(mesh: Mesh, distances_mm: FloatArray, limit_mm: float, *, sig
     if signed:
         return Layer(mesh, scalars=distances_mm, colormap=DIVERGING, vmin=-limit_mm, vmax=limit_mm)
     return Layer(mesh, scalars=np.abs(distances_mm), colormap=SEQUENTIAL, vmax=limit_mm)
+
+
+_PART_COLOURS = np.array(PARTS)
+
+
+def part_layer(mesh: Mesh, labels: npt.NDArray[np.integer[Any]] | None) -> Layer:
+    """Return a layer in the colours of its parts.
+
+    Args:
+        mesh: the surface or points.
+        labels: (V,) index of the part of each vertex; None for one part, which has the colour of layers.
+    """
+    if labels is None:
+        return Layer(mesh)
+    codes, end = np.asarray(labels % len(PARTS), dtype=np.float64), len(PARTS) - 0.5
+    return Layer(mesh, scalars=codes, colormap=_PART_COLOURS, vmin=-0.5, vmax=end, categories=True)
 
 
 @dataclass(frozen=True, eq=False)

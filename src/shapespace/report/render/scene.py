@@ -25,6 +25,7 @@ from shapespace.errors import InputError, MeshError
 from shapespace.geometry.normals import drawable
 from shapespace.geometry.remesh import collapse
 from shapespace.report.inputs.saved_fits import StagedFit, mean_mm, measured_mm
+from shapespace.report.inputs.subject_parts import Parts, articulation_of
 from shapespace.report.render import palette as colours
 from shapespace.schemas import FitRecord, to_json
 from shapespace.types import FloatArray, IntArray, Mesh
@@ -141,7 +142,9 @@ def pack_model(model: ShapeModel, modes: int | None = None, *, small: bool = Fal
     """Return the data of `Shapespace.Model` and the modes widget.
 
     Arrays: `mean` (V, 3) mm; `faces` (F, 3), absent for point models; `modes` (K, V, 3) quantised, the displacement of
-    one standard deviation of each mode, mm; `stddev` (K,) mm; `share` (K,) of the training variance.
+    one standard deviation of each mode, mm; `stddev` (K,) mm; `share` (K,) of the training variance; of a model of
+    several parts, `parts` (V,) the index of the part. If their relative pose is modelled, mean and modes are those of
+    tangent vertices, and `template` (V, 3) and the fact `joints` determine the vertices (docs/structures.md).
 
     Args:
         model: any model.
@@ -157,16 +160,34 @@ def pack_model(model: ShapeModel, modes: int | None = None, *, small: bool = Fal
     order, faces = np.arange(model.n_vertices), model.faces
     if small and faces is not None:
         order, faces = _neighbours_together(faces, model.n_vertices)
-    mode_shapes = np.stack([model.reconstruct(b) - model.mean_vertices for b in np.diag(model.stddev[:K])])
+    rank = np.argsort(order)
+    joints: dict[str, Any] = {}
+    if model.is_linear:
+        mean, template = model.mean_vertices, None
+        mode_shapes = np.stack([model.reconstruct(b) - mean for b in np.diag(model.stddev[:K])])
+    else:
+        articulation = articulation_of(model)
+        mean, template = model.coding["mean"].reshape(-1, 3), articulation.template
+        mode_shapes = (model.basis[:, :K] * model.stddev[:K]).T.reshape(K, -1, 3)
+        joints["joints"] = [
+            {"part": joint.part, "parent": joint.parent, "own": rank[joint.own].tolist(),
+             "other": rank[joint.other].tolist()}
+            for joint in articulation.joints
+        ]  # fmt: skip
     arrays: dict[str, npt.NDArray[Any] | Steps] = {
-        "mean": quantise(model.mean_vertices[order], step=_PLACE_STEP_MM, coded=True) if small else model.mean_vertices,
+        "mean": quantise(mean[order], step=_PLACE_STEP_MM, coded=True) if small else mean,
         "modes": quantise(mode_shapes[:, order], step=_MODE_STEP_MM if small else 0.0, by_row=True, coded=small),
         "stddev": model.stddev[:K],
         "share": model.stddev[:K] ** 2 / model.total_variance,
     }
     arrays |= _indices("faces", faces, model.n_vertices, coded=small)
-    rank = np.argsort(order)
+    if template is not None:
+        both = {"mean": mean[order], "template": template[order]}
+        arrays |= _shared_steps(both) if small else {"template": template}
+    parts = _parts(Parts.of(model), order, arrays)
     facts = {
+        **parts,
+        **joints,
         "landmarks": {
             name: {"vertices": rank[corners].tolist(), "weights": weights.tolist()}
             for name, corners, weights in zip(
@@ -304,6 +325,7 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: i
     }
     if staged.regions is not None:
         arrays["regions"] = staged.regions[of_model].astype(np.uint8)
+    parts = _parts(staged.parts, of_model, arrays)
     if staged.history and not small:
         arrays |= _history(staged)
     arrays |= _colours(staged, of_model, of_scan)
@@ -319,6 +341,7 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: i
             stage: {"model": mean_mm(staged.model_to_scan_mm[stage]), "scan": mean_mm(staged.scan_to_model_mm[stage])}
             for stage in staged.surfaces
         },
+        **parts,
         "region_shares": list(staged.region_shares.values()),
         "thinned": len(scan.vertices) < len(staged.scan.vertices) or len(model.vertices) < len(last.vertices),
     }
@@ -326,8 +349,9 @@ def pack_fit(staged: StagedFit, *, largest_scan: int | None = None, most_sent: i
 
 
 def pack_surfaces(
-    surfaces: Mapping[str, Mesh], record: FitRecord, *, name: str, label: str, reason: str, largest: int | None = None
-) -> bytes:
+    surfaces: Mapping[str, Mesh], record: FitRecord, *, name: str, label: str, reason: str, largest: int | None = None,
+    parts: Parts | None = None,
+) -> bytes:  # fmt: skip
     """Return the data for the widget of a fit without its scan: as `pack_fit`, without scan and distances.
 
     Args:
@@ -337,6 +361,7 @@ def pack_surfaces(
         label: label in pictures.
         reason: reason why the scan is not shown, as the end of a sentence.
         largest: largest number of triangles (or points) in a report; None packs all as it is.
+        parts: parts of the model; None if it has one structure, or is not known.
     """
     last = list(surfaces.values())[-1]
     model, source_rows = (last, np.arange(len(last.vertices))) if largest is None else _decimate(last, largest)
@@ -346,6 +371,7 @@ def pack_surfaces(
     arrays |= _shared_steps(places) if small else {key: _places(points, small) for key, points in places.items()}
     arrays |= {key: np.array(getattr(record, key), dtype=np.float64) for key in ("b", "z", "b_stddev")}
     facts = {
+        **_parts(parts, source_rows, arrays),
         "name": name,
         "label": label,
         "status": record.status,
@@ -354,6 +380,16 @@ def pack_surfaces(
         "thinned": len(model.vertices) < len(last.vertices),
     }
     return pack(arrays, facts)
+
+
+def _parts(
+    parts: Parts | None, rows: npt.NDArray[np.integer[Any]], arrays: dict[str, npt.NDArray[Any] | Steps]
+) -> dict[str, Any]:
+    """Add the index of the part of each of the vertices `rows` to `arrays`, and return the fact with their names."""
+    if parts is None:
+        return {}
+    arrays["parts"] = parts.labels[rows]
+    return {"parts": list(parts.names)}
 
 
 def _stage_arrays(
@@ -443,6 +479,7 @@ def scripts() -> str:
         "diverging": colours.as_list(colours.DIVERGING),
         "regions": {name: list(colour) for name, colour in colours.REGION_COLOURS.items()},
         "categories": [list(colour) for colour in colours.CATEGORIES],
+        "parts": [list(colour) for colour in colours.PARTS],
         "clay": list(colours.CLAY),
         "scan": list(colours.SCAN_COLOUR),
         "model": list(colours.MODEL_COLOUR),
@@ -544,7 +581,7 @@ def _shares_beyond(signed_mm: FloatArray, scale_mm: float) -> npt.NDArray[Any]:
 
 
 SCENE_SCRIPTS = tuple(f"scene-{part}.js" for part in (
-    "data", "camera", "material", "surfaces", "drawing", "controls", "view", "colours",
+    "data", "articulation", "camera", "material", "surfaces", "drawing", "controls", "view", "colours",
 ))  # fmt: skip
 """Views, shape models and colour bars; they need three.min.js before them."""
 

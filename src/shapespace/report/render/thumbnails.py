@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
@@ -12,6 +13,7 @@ import numpy as np
 from shapespace.errors import InputError
 from shapespace.geometry.normals import Distortion, drawable, faces_of, observed_mask
 from shapespace.report.inputs.saved_fits import StagedFit
+from shapespace.report.inputs.subject_parts import Parts
 from shapespace.report.render.palette import CATEGORIES, DIVERGING, MODEL_COLOUR, SCAN_COLOUR, SEQUENTIAL, Colour
 from shapespace.report.render.renderer import (
     SQUARE_COLOURS,
@@ -19,6 +21,7 @@ from shapespace.report.render.renderer import (
     Image,
     Layer,
     distance_layer,
+    part_layer,
     render,
     render_series,
 )
@@ -109,12 +112,13 @@ def mean_at_vertices(values: FloatArray, faces: IntArray, vertices: int) -> Floa
     )
 
 
-def mesh_still(mesh: Mesh, panel: tuple[int, int] = PANEL) -> Still:
-    """Render one mesh from the front, without rotation."""
+def mesh_still(mesh: Mesh, panel: tuple[int, int] = PANEL, parts: Parts | None = None) -> Still:
+    """Render one mesh from the front, without rotation, in the colours of its parts if it has several."""
     camera = Camera.framing(mesh.vertices, aspect=panel[0] / panel[1], margin=0.06)
     # Points are drawn as balls, of a size that joins them whatever the unit of the file.
     radius = 0.004 * float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
-    return encoded(render(Layer(mesh, point_radius_mm=max(radius, 1e-9)), camera=camera, size=panel))
+    layer = replace(part_layer(mesh, parts and parts.labels), point_radius_mm=max(radius, 1e-9))
+    return encoded(render(layer, camera=camera, size=panel))
 
 
 def colour_bar(colours: Sequence[Sequence[float]] | np.ndarray = DIVERGING) -> Still:

@@ -4,7 +4,7 @@
 
   const Viewer = window.ShapespaceViewer;
   const { save, alertUser, guarded } = Viewer;
-  const { make: h } = Shapespace.widgetParts;
+  const { make: h, partControls } = Shapespace.widgetParts;
   const WORDS = { unreadable: "unreadable", excluded: "excluded", doubtful: "doubtful", look: "needs review", converged: "converged" };
   const DOTS = { unreadable: "unreadable", excluded: "failed", doubtful: "doubtful", look: "doubtful", converged: "converged" };
 
@@ -66,7 +66,7 @@
       cell.scan = name;
       viewsOf(cell).forEach((view, k) => {
         view.label = `${name} in 3-D${k ? ", from the opposite side" : ""}`;
-        view.setSurface("surface", { positions, faces: mean.faces, draft: mean.draft, colour: colours.clay });
+        view.setSurface("surface", { positions, faces: mean.faces, draft: mean.draft, parts: mean.parts, colour: colours.clay });
       });
       paint(cell);
       drawMarks(cell);
@@ -158,8 +158,9 @@
     function drawMarks(cell) {
       const shown = [], gone = [];
       cell.marked = [];
+      const placed = cell.view.placed("surface", cell.positions);
       [...marks.map((vertex) => ({ vertex })), ...named.filter((one) => one.vertex < about.vertices)].forEach((mark, k) => {
-        const position = Array.from(cell.positions.subarray(3 * mark.vertex, 3 * mark.vertex + 3));
+        const position = Array.from(placed.subarray(3 * mark.vertex, 3 * mark.vertex + 3));
         if (!position.every(Number.isFinite)) { gone.push(mark.name ?? mark.vertex); return; }
         cell.marked.push(mark);
         shown.push({ position, label: mark.name ?? String(mark.vertex), colour: markColour(k) });
@@ -289,6 +290,13 @@
       for (const name of ["growth", "distance"]) $("colours").querySelector(`[data-colour=${name}]`).hidden = !faults.size;
     }
 
+    /** Controls of the parts of a subject, whose colours the surfaces have where no map is on. */
+    function startParts() {
+      if (!about.parts.length) return;
+      $("colours").querySelector("[data-colour=plain]").textContent = "Parts";
+      $("parts").replaceChildren(h("h2", {}, "Parts"), partControls(about.parts, () => cells.flatMap(({ view, back }) => [view, back]), drawAllMarks).element);
+    }
+
     function startScans() {
       $("previous").addEventListener("click", () => showPage(first - perPage()));
       $("next").addEventListener("click", () => showPage(first + perPage()));
@@ -334,6 +342,7 @@
       cells[0].view.on("camera", placed);
       startMarks();
       startScans();
+      startParts();
       drawAllMarks();
       $("loading").hidden = true;
       window.shapespaceCells = cells;

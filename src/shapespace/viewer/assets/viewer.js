@@ -113,6 +113,7 @@
       const z = coefficientsOf(wanted.z, about.modes), stage = new Stage($("stage"), false);
       Object.assign(page, { about, model, z, stage });
       stage.panes.append($("tools"));
+      stage.setParts(unpacked.facts.parts);
       window.shapespaceStage = stage;
       const unsent = about.modes_sent < about.modes ? `, of which the first ${about.modes_sent} are shown; more would not fit here` : "";
       $("about").textContent = `${about.model}: ${about.vertices.toLocaleString("en")} vertices, ${about.modes} ${about.modes === 1 ? "mode" : "modes"}${unsent}`;
