@@ -572,6 +572,7 @@ class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
             reuses the results.
         results_hash: SHA-256 of the files that the run wrote, except this one.
         added: NAMEs of scans that were registered to the mean after the run, and did not affect the mean.
+        parts: name -> number of vertices of each part, in the order of the vertices; empty for objects of one part.
     """
 
     CALLED: ClassVar = "a correspondence"
@@ -596,6 +597,7 @@ class CorrespondenceRecord(Struct, frozen=True, kw_only=True):
     added: list[str] = []
     doubtful: list[str] = []
     needs_review: dict[str, list[ReviewCode]] = {}
+    parts: dict[str, int] = {}
     format: str = FORMAT
     format_version: int = VERSION
 

@@ -19,7 +19,7 @@ from shapespace.batch.fit_work import FitJob
 from shapespace.batch.parallel_rounds import RoundRunner
 from shapespace.batch.progress import progress, telling_of_compiling, waiting
 from shapespace.batch.result_folder import names_for, only_writer
-from shapespace.commands.inputs import LandmarkFiles, given_scans, with_ids
+from shapespace.commands.inputs import LandmarkFiles, given_scans, scans_of_parts, with_ids
 from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
 from shapespace.correspondence.first_template import first_template, usable_scan
 from shapespace.correspondence.groupwise import correspond
@@ -65,6 +65,8 @@ class CorrespondFiles:
         recursive: take scans in folders below those given too.
         strict: exclude scans with triangles that use vertices with non-finite coordinates.
         subjects: column of the list of scans that names the subjects, or None.
+        parts: names of the parts of each specimen, each with scans of its own; empty for objects of one part.
+        part: name of the part whose scans are used.
     """
 
     scans: Sequence[str | Path]
@@ -75,6 +77,8 @@ class CorrespondFiles:
     recursive: bool = False
     strict: bool = False
     subjects: str | None = None
+    parts: Sequence[str] = ()
+    part: str = ""
 
 
 def correspond_files(
@@ -157,6 +161,8 @@ def find_jobs(files: CorrespondFiles, folder: Path, say: Say) -> list[FitJob]:
         InputError: there are no scans, or two would have one name.
     """
     given = given_scans(files.scans, folder, recursive=files.recursive, say=say)
+    if files.part:
+        given = scans_of_parts(given, files.parts)[files.part]
     distinct = list({scan.source: scan for scan in given}.values())
     scans = [scan for scan in distinct if not scan.path.name.endswith(SURFACE)]
     if len(scans) < len(distinct):
@@ -196,7 +202,7 @@ def bring(
     noted = [replace(scan, notes=tuple(read.notes.get(scan.name, ()))).noting(*scan.notes) for scan in scans]
     made = replace(made, scans=tuple(noted))
     size = rms_size(made.template.vertices)
-    records = [_make_record(job, scan, read, results.path, size) for job, scan in zip(jobs, made.scans, strict=True)]
+    records = [make_record(job, scan, read, results.path, size) for job, scan in zip(jobs, made.scans, strict=True)]
     for sentence in made.notes:
         say(sentence)
     report_landmarks(records, read, say)
@@ -370,7 +376,7 @@ def report_landmarks(records: Sequence[CorrespondRecord], read: ScansRead, say: 
     say(f"{sentence}{after}.")
 
 
-def _make_record(job: FitJob, scan: Corresponding, read: ScansRead, folder: Path, mean_size: float) -> CorrespondRecord:
+def make_record(job: FitJob, scan: Corresponding, read: ScansRead, folder: Path, mean_size: float) -> CorrespondRecord:
     """Return the record of a scan; `mean_size` is the RMS size of the mean shape."""
     source = job.source(folder)
     record = CorrespondRecord(

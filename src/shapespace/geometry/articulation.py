@@ -19,12 +19,15 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from shapespace.errors import InputError
+from shapespace.geometry.procrustes import Gauge, align_shapes, centroid_size
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.types import FloatArray, IntArray
 
 _JOINT_SHARE = 0.05
 """Share of a part's vertices, those nearest to the other part, whose mean is its side of the joint."""
 _FEWEST = 4  # vertices of a part, which determine its pose
+_ROUNDS, _STILL = 20, 1e-7
+"""Limit of the iterations of the mean of the parts, and the movement, as a share of the size, that ends them."""
 
 
 def _skew(v: FloatArray) -> FloatArray:
@@ -249,3 +252,37 @@ def _inertia(x: FloatArray) -> FloatArray:
 def _rotation_of(off: FloatArray, centred: FloatArray, inverse_inertia: FloatArray) -> FloatArray:
     """Return the rotation vector (3,) of the small rigid motion that is nearest to displacements `off` (V, 3)."""
     return inverse_inertia @ np.cross(centred, off).sum(axis=0)
+
+
+def size_of_parts(vertices: FloatArray, counts: Sequence[int]) -> float:
+    """Return the root of the sum of the squared centroid sizes of parts (V, 3), which does not depend on their pose."""
+    return float(np.linalg.norm([centroid_size(part) for part in np.split(vertices, np.cumsum(counts)[:-1])]))
+
+
+def articulate(
+    shapes: FloatArray, counts: Sequence[int], gauge: Gauge
+) -> tuple[Articulation, list[PartPoses], FloatArray]:
+    """Return the mean of parts, the parts of each shape about the mean, and the sizes (N,) that are divided out.
+
+    Args:
+        shapes: (N, V, 3) vertices, mm, aligned to each other.
+        counts: number of vertices of each part.
+        gauge: size handling: `shape` divides the size of all parts together out, relative to its mean; `form` keeps it,
+            and the returned sizes are ones.
+
+    Raises:
+        InputError: the parts of a shape have no pose, see `Articulation`.
+    """
+    larger = np.ones(len(shapes))
+    if gauge == "shape":
+        larger = np.array([size_of_parts(shape, counts) for shape in shapes])
+        larger /= larger.mean()
+        shapes = align_shapes(shapes / larger[:, None, None], "form")
+    template = shapes.mean(axis=0)
+    for _ in range(_ROUNDS):
+        articulation = Articulation(template, counts)
+        poses = [articulation.poses_of(shape) for shape in shapes]
+        template = articulation.decode(np.mean([articulation.to_tangent(own) for own in poses], axis=0))
+        if np.abs(template - articulation.template).max() <= _STILL * np.ptp(template):
+            break
+    return articulation, poses, larger

@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 
 from shapespace.errors import InputError
-from shapespace.geometry.articulation import Articulation
+from shapespace.geometry.articulation import Articulation, articulate
 from shapespace.geometry.bspline import SplineSquare
 from shapespace.geometry.flatten import disc_map
 from shapespace.geometry.mirror_plane import mirrored_note
@@ -371,32 +371,13 @@ def _regions_of_parts(parts: Mapping[str, int], meshes: Sequence[Mesh]) -> dict[
     }
 
 
-_TEMPLATE_ROUNDS, _TEMPLATE_STILL = 20, 1e-7
-"""Limit of the iterations of the mean of the parts, and the movement, as a share of the size, that ends them."""
-
-
 def _shapes_of_parts(
     shapes: FloatArray, counts: Sequence[int], config: BuildConfig
 ) -> tuple[Articulation, FloatArray, FloatArray]:
-    """Return the mean of the parts, and the shapes (N, V, 3) as tangent vertices, or with the mean relative pose.
-
-    Also return the size (N,) of each that is divided out, relative to the mean: the root of the sum of the squared
-    centroid sizes of the parts, which does not depend on their relative pose; ones with the gauge `form`.
+    """Return the mean of the parts, the shapes (N, V, 3) as tangent vertices, or with the mean relative pose, and the
+    size (N,) of each that is divided out, see `articulate`.
     """
-    larger = np.ones(len(shapes))
-    if config.gauge == "shape":
-        ends = np.cumsum(counts)[:-1]
-        larger = np.array([np.linalg.norm([centroid_size(x) for x in np.split(shape, ends)]) for shape in shapes])
-        larger /= larger.mean()
-        shapes = align_shapes(shapes / larger[:, None, None], "form")
-    template = shapes.mean(axis=0)
-    for _ in range(_TEMPLATE_ROUNDS):
-        articulation = Articulation(template, counts)
-        poses = [articulation.poses_of(shape) for shape in shapes]
-        mean = np.mean([articulation.to_tangent(own) for own in poses], axis=0)
-        template = articulation.decode(mean)
-        if np.abs(template - articulation.template).max() <= _TEMPLATE_STILL * np.ptp(template):
-            break
+    articulation, poses, larger = articulate(shapes, counts, config.gauge)
     if config.relative_pose == "removed":
         return articulation, articulation.template + np.stack([own.shape for own in poses]), larger
     return articulation, np.stack([articulation.to_tangent(own) for own in poses]), larger

@@ -99,6 +99,7 @@ class SurfaceFiles:
         needs_review: surfaces that need review, doubtful ones among them -> reasons, by the records of their
             correspondence.
         notes: remarks for the user.
+        parts: name -> number of vertices of each part of the objects; empty for objects of one part.
     """
 
     files: tuple[Path, ...]
@@ -107,6 +108,7 @@ class SurfaceFiles:
     doubtful: frozenset[Path]
     notes: tuple[str, ...]
     needs_review: Mapping[Path, Sequence[ReviewCode]] = field(default_factory=dict[Path, Sequence[ReviewCode]])
+    parts: Mapping[str, int] = field(default_factory=dict[str, int])
 
     def __len__(self) -> int:
         return len(self.files)
@@ -208,6 +210,7 @@ def surface_files(paths: Sequence[Path], *, recursive: bool = False) -> SurfaceF
         FileFormatError: a correspondence.json that is no record of a correspondence.
     """
     files: list[Path] = []
+    parts: dict[Path, Mapping[str, int]] = {}
     notes: list[str] = []
     for path in paths:
         summary = _summary_of(path)
@@ -228,6 +231,7 @@ def surface_files(paths: Sequence[Path], *, recursive: bool = False) -> SurfaceF
     needs_review: dict[Path, Sequence[ReviewCode]] = {}
     for folder in dict.fromkeys(file.parent for file in files if file.name.endswith(SURFACE)):
         if (summary := _summary_of(folder)) is not None:
+            parts[folder] = summary.parts
             other_units = {folder / f"{name}{SURFACE}": ratio for name, ratio in summary.other_units.items()}
             ratios |= {file: other_units[file] for file in files if file in other_units}
             reflected = {folder / f"{name}{SURFACE}" for name in summary.mirrored}
@@ -239,7 +243,13 @@ def surface_files(paths: Sequence[Path], *, recursive: bool = False) -> SurfaceF
         of = "meshes is a mirror image" if len(mirrored) == 1 else "meshes are mirror images"
         names = first_names([file.name for file in files if file in mirrored], _NAMED)
         notes.append(f"{len(mirrored)} of {len(files)} {of} of the others ({names}) and reflected.")
-    return SurfaceFiles(tuple(files), ratios, frozenset(mirrored), frozenset(doubtful), tuple(notes), needs_review)
+    if len({tuple(own.items()) for own in parts.values()}) > 1:
+        stated = "; ".join(f"{folder}: {', '.join(own) or 'none'}" for folder, own in parts.items())
+        raise InputError(f"The folders have different parts ({stated}); give surfaces of the same parts.")
+    return SurfaceFiles(
+        tuple(files), ratios, frozenset(mirrored), frozenset(doubtful), tuple(notes), needs_review,
+        next(iter(parts.values()), dict[str, int]()),
+    )  # fmt: skip
 
 
 def reviewed_surfaces(
