@@ -5,8 +5,8 @@
 
 Limbs are samples of a published model of the pelvis and the lower limb (../shared/data/lower_limb, for tests only),
 with a knee that is flexed by 0 to 40 degrees. The bones of a limb are raw scans in one frame: each has triangles of its
-own, 0.2 mm of noise, and the limb has any pose and size. `correspond --parts` is compared with each bone alone. The error of
-the relative pose is that of each bone against the femur, by the true places of the vertices.
+own, 0.2 mm of noise, and the limb has any pose and size. `correspond --parts` is compared with each bone alone. The
+error of the relative pose is that of each bone against the femur, by the true places of the vertices.
 """
 
 from __future__ import annotations

@@ -26,6 +26,7 @@ from shapespace.correspondence.groupwise import correspond
 from shapespace.correspondence.registration import RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.errors import InputError, ShapespaceError
+from shapespace.geometry.grooming import pieces_of
 from shapespace.geometry.landmark_placement import place_landmarks
 from shapespace.geometry.mirror_plane import mirror_image
 from shapespace.geometry.normals import faces_of, rms_size
@@ -109,6 +110,12 @@ def correspond_files(
         template = None if files.template is None else marks.onto(read_mesh(files.template), files.template)
         model = None if files.model is None else ShapeModel.load(files.model)
         read = read_scans(jobs, marks, strict=files.strict, outer=config.outer, quiet=quiet, say=say)
+        several = [name for name, scan in read.scans.items() if _has_pieces(scan)]
+        if 2 * len(several) > len(read.scans):
+            say(
+                f"{len(several)} of {len(read.scans)} scans have several separate pieces, and the first template has "
+                "only the largest; if the pieces are structures of one subject, give a file for each, and --parts."
+            )
         without_inner = replace(config, outer=False)  # the scans that are read are without inner surfaces
 
         def make(rounds: RoundsWithProgress) -> Correspondence:
@@ -132,6 +139,10 @@ def correspond_files(
         if old := results.forget_others({record.name for record in records}):
             say(f"Results of {old} scans that are not among those given were removed from {results.path}.")
         return results.publish(made, records, with_scans(summary, records), with_mean=True), records
+
+
+def _has_pieces(scan: Mesh) -> bool:
+    return scan.faces is not None and len(np.unique(pieces_of(scan.faces, len(scan.vertices))[1])) > 1
 
 
 def correspond_groups(

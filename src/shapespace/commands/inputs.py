@@ -250,7 +250,9 @@ def scans_of_parts(scans: Sequence[Given], parts: Sequence[str]) -> dict[str, li
             is_end = stem.casefold().endswith(tuple(f"{separator}{name}" for separator in "_-."))
             if own == name or (not own and (is_end or scan.path.parent.name.casefold() == name)):
                 specimen = scan.called or scan.column(*_SPECIMENS) or (stem[: -len(part) - 1] if is_end else stem)
-                if other := next((one for one in there if one.called.casefold() == specimen.casefold()), None):
+                if other := next(
+                    (earlier for earlier in there if earlier.called.casefold() == specimen.casefold()), None
+                ):
                     raise InputError(
                         f"{other.source} and {scan.source} are both the {part} of {specimen}; omit or rename one."
                     )

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, replace
+from functools import cache
 from itertools import combinations
 
 import numpy as np
@@ -56,7 +57,7 @@ def join_parts(parts: Mapping[str, Correspondence], *, doubts: Mapping[str, str]
         ['left', 'right']
     """
     if len(parts) < 2:
-        raise InputError(f"Parts are the structures of one subject, two or more, not {len(parts)}; give all of them.")
+        raise InputError(f"Parts are the structures of one subject, two or more, not {len(parts)}; give each part.")
     joint = _PartScans(_on_one_side(parts), doubts or {})
     counts = list(joint.counts.values())
     poses = _PoseCheck(joint)
@@ -116,6 +117,7 @@ def robust_z(values: FloatArray) -> FloatArray:
     return off / np.maximum(_TO_STDDEV * np.nanmedian(off, axis=0), _SAME_POSE)
 
 
+@cache
 def outlier_limit(count: int, columns: int) -> float:
     """Return the limit that the largest of `robust_z` of normal values (count, columns) exceeds in 5 % of all cases."""
     rng = np.random.default_rng(0)
