@@ -397,6 +397,8 @@ COMMANDS: tuple[CommandSpec, ...] = (
             basic("--landmarks", "DIR", "landmarks of all or some scans: files with the names of the scans and another "
                   "ending, in any landmark format", parse=Path),
             basic("--vertices", "N", source=CORRESPOND, parse=values.positive),
+            advanced("--parts", "NAME", "parts of each specimen, such as femur tibia: NAME_femur.ply and so on, scans "
+                     "in folders femur and tibia, or in a list with the columns part and specimen", nargs="+"),
             basic("--add", source=CHANGE_CORRESPONDENCE, either=_CHANGE),
             advanced("--redo", "NAME", source=CHANGE_CORRESPONDENCE, repeat=True, default=[],
                      either=_CHANGE),

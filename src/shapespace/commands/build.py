@@ -176,6 +176,7 @@ def build(
         landmarks=marks,
         provenance=provenance,
         min_seen=MIN_SEEN if config.min_seen is None else config.min_seen,
+        parts=dict(listed.parts) or None,
     )
     config = replace(config, model=chosen)
     additive = None

@@ -19,13 +19,14 @@ from shapespace.batch.fit_work import FitJob
 from shapespace.batch.parallel_rounds import RoundRunner
 from shapespace.batch.progress import progress, telling_of_compiling, waiting
 from shapespace.batch.result_folder import names_for, only_writer
-from shapespace.commands.inputs import LandmarkFiles, given_scans, with_ids
+from shapespace.commands.inputs import LandmarkFiles, given_scans, scans_of_parts, with_ids
 from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
 from shapespace.correspondence.first_template import first_template, usable_scan
 from shapespace.correspondence.groupwise import correspond
 from shapespace.correspondence.registration import RegistrationTask, RoundContext, ScanRegistration
 from shapespace.correspondence.settings import CorrespondConfig
 from shapespace.errors import InputError, ShapespaceError
+from shapespace.geometry.grooming import pieces_of
 from shapespace.geometry.landmark_placement import place_landmarks
 from shapespace.geometry.mirror_plane import mirror_image
 from shapespace.geometry.normals import faces_of, rms_size
@@ -65,6 +66,8 @@ class CorrespondFiles:
         recursive: take scans in folders below those given too.
         strict: exclude scans with triangles that use vertices with non-finite coordinates.
         subjects: column of the list of scans that names the subjects, or None.
+        parts: names of the parts of each specimen, each with scans of its own; empty for objects of one part.
+        part: name of the part whose scans are used.
     """
 
     scans: Sequence[str | Path]
@@ -75,6 +78,8 @@ class CorrespondFiles:
     recursive: bool = False
     strict: bool = False
     subjects: str | None = None
+    parts: Sequence[str] = ()
+    part: str = ""
 
 
 def correspond_files(
@@ -105,6 +110,12 @@ def correspond_files(
         template = None if files.template is None else marks.onto(read_mesh(files.template), files.template)
         model = None if files.model is None else ShapeModel.load(files.model)
         read = read_scans(jobs, marks, strict=files.strict, outer=config.outer, quiet=quiet, say=say)
+        several = [name for name, scan in read.scans.items() if _has_pieces(scan)]
+        if 2 * len(several) > len(read.scans):
+            say(
+                f"{len(several)} of {len(read.scans)} scans have several separate pieces, and the first template has "
+                "only the largest; if the pieces are structures of one subject, give a file for each, and --parts."
+            )
         without_inner = replace(config, outer=False)  # the scans that are read are without inner surfaces
 
         def make(rounds: RoundsWithProgress) -> Correspondence:
@@ -128,6 +139,10 @@ def correspond_files(
         if old := results.forget_others({record.name for record in records}):
             say(f"Results of {old} scans that are not among those given were removed from {results.path}.")
         return results.publish(made, records, with_scans(summary, records), with_mean=True), records
+
+
+def _has_pieces(scan: Mesh) -> bool:
+    return scan.faces is not None and len(np.unique(pieces_of(scan.faces, len(scan.vertices))[1])) > 1
 
 
 def correspond_groups(
@@ -157,6 +172,8 @@ def find_jobs(files: CorrespondFiles, folder: Path, say: Say) -> list[FitJob]:
         InputError: there are no scans, or two would have one name.
     """
     given = given_scans(files.scans, folder, recursive=files.recursive, say=say)
+    if files.part:
+        given = scans_of_parts(given, files.parts)[files.part]
     distinct = list({scan.source: scan for scan in given}.values())
     scans = [scan for scan in distinct if not scan.path.name.endswith(SURFACE)]
     if len(scans) < len(distinct):
@@ -196,7 +213,7 @@ def bring(
     noted = [replace(scan, notes=tuple(read.notes.get(scan.name, ()))).noting(*scan.notes) for scan in scans]
     made = replace(made, scans=tuple(noted))
     size = rms_size(made.template.vertices)
-    records = [_make_record(job, scan, read, results.path, size) for job, scan in zip(jobs, made.scans, strict=True)]
+    records = [make_record(job, scan, read, results.path, size) for job, scan in zip(jobs, made.scans, strict=True)]
     for sentence in made.notes:
         say(sentence)
     report_landmarks(records, read, say)
@@ -370,7 +387,7 @@ def report_landmarks(records: Sequence[CorrespondRecord], read: ScansRead, say: 
     say(f"{sentence}{after}.")
 
 
-def _make_record(job: FitJob, scan: Corresponding, read: ScansRead, folder: Path, mean_size: float) -> CorrespondRecord:
+def make_record(job: FitJob, scan: Corresponding, read: ScansRead, folder: Path, mean_size: float) -> CorrespondRecord:
     """Return the record of a scan; `mean_size` is the RMS size of the mean shape."""
     source = job.source(folder)
     record = CorrespondRecord(

@@ -5,7 +5,6 @@ With an update one more round over all scans follows, which computes the mean an
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,30 +30,22 @@ from shapespace.commands.correspond import (
     read_scans,
     with_scans,
 )
-from shapespace.commands.inputs import TABLE_ENDINGS, Given, LandmarkFiles
+from shapespace.commands.correspond_parts import check_parts, correspond_each_part, expand_part_folders
+from shapespace.commands.finished_correspondence import FinishedFolder
+from shapespace.commands.inputs import TABLE_ENDINGS, LandmarkFiles
 from shapespace.commands.outcome import Aside, Outcome, first_lines
 from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
 from shapespace.correspondence.groupwise import FinishedCorrespondence, add_scans
 from shapespace.correspondence.scan_status import SurfaceMeasures
 from shapespace.correspondence.settings import FEWEST, CorrespondConfig
 from shapespace.errors import InputError
-from shapespace.geometry.mirror_plane import mirror_image
-from shapespace.geometry.normals import faces_of, rms_size
+from shapespace.geometry.normals import rms_size
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.landmarks.landmark_io import read_surface_landmarks
-from shapespace.io.meshes.mesh_io import read_mesh
-from shapespace.io.remote import is_address
-from shapespace.reprs import first_names
-from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, SurfaceReview, read, to_json
-from shapespace.store.corresponding import LANDMARKS, MEAN, SUMMARY, SURFACE, describe_review, review_summary
-from shapespace.types import Mesh, SurfaceLandmarks
+from shapespace.schemas import CorrespondenceRecord, CorrespondRecord, SurfaceReview, to_json
+from shapespace.store.corresponding import LANDMARKS, SUMMARY, describe_review, review_summary
+from shapespace.types import SurfaceLandmarks
 
-_OPTIONS = {
-    "vertices": "--vertices", "rounds": "--rounds", "outer": "--outer", "ignore_colours": "--set ignore_colours",
-    "mirror": "--mirror", "pose": "--pose", "landmark_uncertainty": "--set landmark_uncertainty",
-    "seed": "--set seed",
-}  # fmt: skip
-"""Options of the settings that a change takes from the finished correspondence, by their fields."""
 _LISTED = 5  # names in a message, so that it stays short
 
 
@@ -83,87 +74,6 @@ class Change:
         return "--add" if self.add else "--redo" if self.redo else "--remove" if self.remove else "--update"
 
 
-@dataclass(frozen=True)
-class _FinishedFolder:
-    """A finished correspondence in a folder.
-
-    Args:
-        results: the folder.
-        summary: summary of the run.
-        records: records of all scans by name, those in correspondence first.
-        mean: mean shape.
-        surfaces: surfaces of the scans in correspondence, by name; those of mirrored scans are reflected.
-    """
-
-    results: CorrespondenceFolder
-    summary: CorrespondenceRecord
-    records: dict[str, CorrespondRecord]
-    mean: Mesh
-    surfaces: dict[str, Mesh]
-
-    @staticmethod
-    def of(results: CorrespondenceFolder) -> _FinishedFolder:
-        """Read all files of a correspondence.
-
-        Raises:
-            InputError: its files do not belong together.
-            FileError, FileFormatError: a file cannot be read, or is damaged.
-        """
-        folder, (summary, records) = results.path, results.read()
-        mean = read_mesh(folder / MEAN)
-        files = {name: read_mesh(folder / f"{name}{SURFACE}") for name in summary.corresponding}
-        surfaces = {name: mirror_image(mesh) if name in summary.mirrored else mesh for name, mesh in files.items()}
-        fault = ""
-        if len(mean.vertices) != summary.vertices:
-            fault = f"{MEAN} has {len(mean.vertices)} vertices, and the correspondence {summary.vertices}"
-        elif other := [
-            name for name, surface in surfaces.items() if not np.array_equal(faces_of(surface), faces_of(mean))
-        ]:
-            fault = f"{other[0]}{SURFACE} and {MEAN} have different triangles, so one of them was changed"
-        elif summary.results_hash not in ("", results.hash_of(summary)):
-            fault = "its files were changed after the correspondence"
-        if fault:
-            raise InputError(f"{folder}: {fault}; {CORRESPOND_AGAIN}.")
-        return _FinishedFolder(results, summary, records, mean, surfaces)
-
-    def config(self, files: CorrespondFiles, asked: CorrespondConfig) -> CorrespondConfig:
-        """Return the settings of the correspondence, which `asked` must not contradict.
-
-        Raises:
-            InputError: options ask for something else.
-        """
-        config = read(CorrespondConfig, self.summary.settings, str(self.results.path / SUMMARY), CORRESPOND_AGAIN)
-        if self.summary.settings.get("symmetric"):
-            raise InputError(
-                f"{self.results.path} was computed with the setting symmetric, which was removed; {CORRESPOND_AGAIN}."
-            )
-        for option, file in (("--template", files.template), ("--model", files.model)):
-            if file is not None:
-                raise InputError(f"The template of a finished correspondence is its mean; omit {option}.")
-        usual = CorrespondConfig()
-        for name, option in _OPTIONS.items():
-            own = getattr(config, name)
-            if getattr(asked, name) not in (own, getattr(usual, name)):
-                value = f"without {option}" if own is False else f"with {option} {own}"
-                raise InputError(f"{self.results.path} was computed {value}, and a change keeps that; omit {option}.")
-        return config
-
-    def check_names(self, names: Sequence[str], option: str) -> None:
-        """Raise InputError if no scan of the correspondence has one of `names`."""
-        for name in names:
-            if name not in self.records:
-                known = first_names(list(self.records), _LISTED)
-                raise InputError(f"{option} {name}: {self.results.path} has no scan of that name; it has {known}.")
-
-    def job(self, name: str) -> FitJob:
-        """Return the job of a scan, from where it was."""
-        record = self.records[name]
-        known = {key: str(value) for key, value in record.metadata.items() if value is not None}
-        if is_address(record.path):
-            return FitJob(name, Given(record.path).path, metadata=known, address=record.path)
-        return FitJob(name, Path(os.path.normpath(self.results.path / record.path)), metadata=known)
-
-
 def change_correspondence(
     change: Change, files: CorrespondFiles, folder: Path, config: CorrespondConfig, *, quiet: bool, say: Say
 ) -> tuple[CorrespondenceRecord, list[CorrespondRecord]]:
@@ -181,7 +91,7 @@ def change_correspondence(
             f"without {change.option} first."
         )
     with CorrespondenceFolder(folder).writing() as results:
-        finished = _FinishedFolder.of(results)
+        finished = FinishedFolder.of(results)
         config, summary = finished.config(files, config), finished.summary
         marks = LandmarkFiles.of(files.landmarks)
         for record in finished.records.values():
@@ -233,7 +143,7 @@ def change_correspondence(
 # Which scans
 
 
-def _new_jobs(finished: _FinishedFolder, change: Change, given: Sequence[FitJob]) -> list[FitJob]:
+def _new_jobs(finished: FinishedFolder, change: Change, given: Sequence[FitJob]) -> list[FitJob]:
     """Return the scans that are registered to the mean: new ones, or those that are registered again."""
     if change.add:
         return _jobs_to_add(finished, given)
@@ -246,7 +156,7 @@ def _new_jobs(finished: _FinishedFolder, change: Change, given: Sequence[FitJob]
     return [by_name.get(name) or finished.job(name) for name in dict.fromkeys(change.redo)]
 
 
-def _jobs_to_add(finished: _FinishedFolder, given: Sequence[FitJob]) -> list[FitJob]:
+def _jobs_to_add(finished: FinishedFolder, given: Sequence[FitJob]) -> list[FitJob]:
     """Return the `given` scans that the correspondence does not have yet; it has no others of the same names."""
     if not given:
         raise InputError("--add needs scans; give their files or folders.")
@@ -260,14 +170,14 @@ def _jobs_to_add(finished: _FinishedFolder, given: Sequence[FitJob]) -> list[Fit
     return [job for job in given if job.name not in finished.records]
 
 
-def _old_jobs(finished: _FinishedFolder, change: Change, given: Sequence[FitJob]) -> list[FitJob]:
+def _old_jobs(finished: FinishedFolder, change: Change, given: Sequence[FitJob]) -> list[FitJob]:
     """Return the scans of the correspondence that stay in it, from the `given` scans or from where they were."""
     moved = {} if change.add else {job.name: job for job in given}
     names = [name for name in finished.records if name not in (*change.redo, *change.remove)]
     return [moved.get(name) or finished.job(name) for name in names]
 
 
-def _check_unchanged(finished: _FinishedFolder, read: ScansRead, files: CorrespondFiles, kept: Sequence[str]) -> None:
+def _check_unchanged(finished: FinishedFolder, read: ScansRead, files: CorrespondFiles, kept: Sequence[str]) -> None:
     """Raise InputError if a scan of `kept` has changed, or if a scan had landmarks that are not given."""
     for name in kept:
         record = finished.records[name]
@@ -286,7 +196,7 @@ def _check_unchanged(finished: _FinishedFolder, read: ScansRead, files: Correspo
 
 
 def _register_scans(
-    finished: _FinishedFolder,
+    finished: FinishedFolder,
     kept: Sequence[str],
     read: ScansRead,
     marks: LandmarkFiles,
@@ -314,7 +224,7 @@ def _register_scans(
     return add_scans(start, added, config, run=rounds)
 
 
-def _registration_of_record(finished: _FinishedFolder, name: str) -> Corresponding:
+def _registration_of_record(finished: FinishedFolder, name: str) -> Corresponding:
     """Return the registration of a scan that is kept unchanged, from its record and its surface."""
     record, surface, mean = finished.records[name], finished.surfaces[name], finished.mean.vertices
     observed = np.ones(len(mean), np.bool_) if surface.observed is None else surface.observed
@@ -330,7 +240,7 @@ def _registration_of_record(finished: _FinishedFolder, name: str) -> Correspondi
 
 
 def _summary(
-    finished: _FinishedFolder,
+    finished: FinishedFolder,
     change: Change,
     records: Sequence[CorrespondRecord],
     every: Mapping[str, CorrespondRecord],
@@ -363,6 +273,7 @@ def correspond(
     landmarks: Path | None,
     subjects: str | None,
     groups: bool,
+    parts: Sequence[str] | None,
     recursive: bool,
     strict: bool,
     quiet: bool,
@@ -381,6 +292,7 @@ def correspond(
         landmarks: folder of landmark files that are named as the scans, or None.
         subjects: column of the list of scans.
         groups: bring each kind of object into correspondence.
+        parts: names of the parts of each specimen, or None.
         recursive: take scans in folders below those given too.
         strict: exclude scans with non-finite coordinates.
         quiet: no progress.
@@ -398,13 +310,49 @@ def correspond(
     if not (change or scans):
         raise InputError("Give scans, or a change of a finished correspondence by --redo, --remove or --update.")
     files = CorrespondFiles(scans, template, model, landmarks, execution, recursive, strict, subjects)
-    if change:
+    if change and (output / SUMMARY).is_file():
+        of_folder = list(CorrespondenceFolder(output).read()[0].parts)
+        if parts is not None and parts != of_folder:
+            raise InputError(f"{output} has the parts {', '.join(of_folder) or 'of one structure'}; omit --parts.")
+        parts = of_folder or None
+    if parts:
+        if groups:
+            raise InputError("--groups cannot be combined with --parts; omit one of the two options.")
+        files = replace(files, scans=expand_part_folders(scans, parts), parts=parts)
+        summary, records = _correspond_parts(change, files, output, config, quiet=quiet, say=say)
+    elif change:
         summary, records = change_correspondence(change, files, output, config, quiet=quiet, say=say)
     else:
         bring = correspond_groups if groups else correspond_files
         summary, records = bring(files, output, config, quiet=quiet, say=say)
     facts = {"folder": str(output), **to_json(summary), "records": to_json(records)}
     return Outcome(facts, _lines(summary, records, output), exit_code=int(bool(summary.set_aside)))
+
+
+def _correspond_parts(
+    change: Change, files: CorrespondFiles, output: Path, config: CorrespondConfig, *, quiet: bool, say: Say
+) -> tuple[CorrespondenceRecord, list[CorrespondRecord]]:
+    """Bring the scans of several parts into correspondence, or change it in the parts that have the named scans."""
+
+    def run(own: CorrespondFiles, folder: Path) -> FinishedFolder:
+        if not change:
+            correspond_files(own, folder, config, quiet=quiet, say=say)
+            return FinishedFolder.of(CorrespondenceFolder(folder))
+        known = CorrespondenceFolder(folder).read()[1]
+        of_part = replace(
+            change,
+            redo=[name for name in change.redo if name in known],
+            remove=[name for name in change.remove if name in known],
+        )
+        if of_part and (find_jobs(own, folder, say) if own.scans and change.add else True):
+            change_correspondence(of_part, own, folder, config, quiet=quiet, say=say)
+        return FinishedFolder.of(CorrespondenceFolder(folder))
+
+    if change:
+        FinishedFolder.of(CorrespondenceFolder(output)).check_names([*change.redo, *change.remove], change.option)
+    else:
+        check_parts(files, output, say)
+    return correspond_each_part(files, output, run, say=say)
 
 
 def _lines(summary: CorrespondenceRecord, records: Sequence[CorrespondRecord], folder: Path) -> list[str]:

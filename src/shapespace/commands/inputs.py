@@ -29,6 +29,10 @@ TABLE_ENDINGS = (".csv", ".tsv", ".xlsx")
 _LISTS = (*TABLE_ENDINGS, ".txt")
 _PLACES = ("scan", "file", "path", "specimen", "name", "id")
 _LANDMARKS, _ID = "landmarks", "id"
+PART = "part"
+"""Column of a list with the part of its specimen that each scan shows."""
+_SPECIMENS = ("specimen", "subject", "name")
+"""Columns of such a list that may name the specimens."""
 _LARGEST_BYTES = 2**26
 """Largest size of a list of scans in bytes; a million rows need less."""
 _FILES_LISTED = 5  # names of files in a message, so that it stays short
@@ -55,6 +59,11 @@ class Given:
     def address(self) -> str:
         """Address of a remote scan; empty for a local one."""
         return self.source if isinstance(self.source, str) else ""
+
+    def column(self, *names: str) -> str:
+        """Return the value in the first of the columns `names` that the list has, in any case; empty without any."""
+        values = {name.casefold(): value.strip() for name, value in self.metadata.items()}
+        return next((values[name] for name in names if values.get(name)), "")
 
     @property
     def path(self) -> Path:
@@ -210,9 +219,10 @@ def _relative_to(file: Path, text: str) -> Path | str:
 
 
 def _check_ids(scans: Sequence[Given]) -> None:
-    named: dict[str, Given] = {}
+    named: dict[tuple[str, str], Given] = {}
     for scan in scans:
-        if scan.called and named.setdefault(scan.called.casefold(), scan).source != scan.source:
+        key = (scan.called.casefold(), scan.column(PART).casefold())
+        if scan.called and named.setdefault(key, scan).source != scan.source:
             raise InputError(f"Two scans have the id {scan.called}; give each one of its own.")
 
 
@@ -220,6 +230,35 @@ def is_of_fit(file: Path, endings: Sequence[str]) -> bool:
     """Return whether a fit wrote `file`, which has one of `endings` and lies next to its record."""
     names = [file.name.removesuffix(ending) for ending in endings if file.name.endswith(ending)]
     return any(file.with_name(f"{name}{RECORD}").is_file() for name in names)
+
+
+def scans_of_parts(scans: Sequence[Given], parts: Sequence[str]) -> dict[str, list[Given]]:
+    """Return the scans of each part, named after their specimens; others are omitted.
+
+    The part of a scan is in the column `part` of a list; otherwise it is the name of its folder, or the end of its file
+    name after `_`, `-` or `.`, as in anna_femur.ply. Its specimen is in the column `id`, `specimen`, `subject` or
+    `name`; otherwise it is the rest of the file name. Upper and lower case are equal.
+
+    Raises:
+        InputError: a specimen has two scans of a part.
+    """
+    found: dict[str, list[Given]] = {part: [] for part in parts}
+    for scan in scans:
+        stem, own = stem_of(scan.path), scan.column(PART).casefold()
+        for part, there in found.items():
+            name = part.casefold()
+            is_end = stem.casefold().endswith(tuple(f"{separator}{name}" for separator in "_-."))
+            if own == name or (not own and (is_end or scan.path.parent.name.casefold() == name)):
+                specimen = scan.called or scan.column(*_SPECIMENS) or (stem[: -len(part) - 1] if is_end else stem)
+                if other := next(
+                    (earlier for earlier in there if earlier.called.casefold() == specimen.casefold()), None
+                ):
+                    raise InputError(
+                        f"{other.source} and {scan.source} are both the {part} of {specimen}; omit or rename one."
+                    )
+                there.append(replace(scan, called=specimen))
+                break
+    return found
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from shapespace.lazy import lazy_names
 if TYPE_CHECKING:
     from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
     from shapespace.correspondence.groupwise import correspond
+    from shapespace.correspondence.joined_parts import join_parts
     from shapespace.correspondence.landmark_transfer import LandmarkCheck, MarkedSpecimens, TransferredLandmarks
     from shapespace.correspondence.settings import CorrespondConfig
     from shapespace.correspondence.symmetric_template import SymmetricMesh, symmetrise
@@ -23,6 +24,7 @@ __all__ = [
     "SymmetricMesh",
     "TransferredLandmarks",
     "correspond",
+    "join_parts",
     "symmetrise",
 ]
 __getattr__, __dir__ = lazy_names(
@@ -30,6 +32,7 @@ __getattr__, __dir__ = lazy_names(
     {
         "correspondence.correspondence_result": ("Correspondence", "Corresponding"),
         "correspondence.groupwise": ("correspond",),
+        "correspondence.joined_parts": ("join_parts",),
         "correspondence.landmark_transfer": ("LandmarkCheck", "MarkedSpecimens", "TransferredLandmarks"),
         "correspondence.settings": ("CorrespondConfig",),
         "correspondence.symmetric_template": ("SymmetricMesh", "symmetrise"),

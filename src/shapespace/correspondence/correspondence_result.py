@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -118,6 +118,8 @@ class Correspondence:
         groups: names of the scans in correspondence, then of those of each other kind of object; empty if all are of
             one kind.
         given: the given template or model, as a subject of a sentence; empty if none was given.
+        parts: name -> number of vertices of each part, in the order of the vertices; empty for objects of one part.
+        remarks: sentences on the parts.
 
     Example:
         >>> correspondence = ss.correspond(meshes[:3], ss.CorrespondConfig(vertices=200, rounds=1, mirror="never"))
@@ -133,6 +135,8 @@ class Correspondence:
     sides_decided: bool = False
     groups: tuple[tuple[str, ...], ...] = ()
     given: str = ""
+    parts: Mapping[str, int] = field(default_factory=dict[str, int])
+    remarks: tuple[str, ...] = ()
 
     __repr__ = short_repr
 
@@ -147,7 +151,7 @@ class Correspondence:
     @property
     def notes(self) -> tuple[str, ...]:
         """Sentences to read before the surfaces are used; all notes on a scan are with the scan."""
-        notes: list[str] = []
+        notes = list(self.remarks)
         if self.is_of_another_kind:
             notes.append(
                 f"{self.given} had to change by {100 * self.moved[0]:.0f} % of its size to become these scans, so it "
