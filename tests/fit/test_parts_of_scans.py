@@ -119,7 +119,7 @@ def test_the_commands_take_the_part_from_the_name_of_the_file(model, tmp_path, c
 def test_what_a_part_does_not_give_is_refused_in_one_sentence(model) -> None:
     subject = make_subjects(1, seed=13)[0]
     scan = Mesh(subject.vertices[:162], BALL.faces, name="bone")
-    with pytest.raises(InputError, match="a region lies in one of them"):
+    with pytest.raises(InputError, match="a region lies in one part"):
         ss.fit_scan(model, scan, ss.FitConfig(region=tuple(range(100, 300))))
     with pytest.raises(InputError, match="one of the parts upper, lower"):
         ss.complete(model, scan, ss.CompletionConfig(fit=ss.FitConfig(region="middle")))

@@ -526,10 +526,10 @@ def _note_penetrations(model: ShapeModel, fitted: Fitted) -> list[str]:
     surface = Mesh(fitted.vertices_scan_mm, model.faces)
     found = find_penetrations(surface, {part: model.regions[part] for part in model.parts})
     return [
-        f"{100 * one.share:.1f} % of the vertices of {one.part} lie inside {one.other}, by up to {one.depth_mm:.1f} "
-        "mm; the parts of a subject do not."
-        for one in found
-        if one.depth_mm > fitted.evidence.posterior_error_mm
+        f"{100 * penetration.share:.1f} % of the vertices of {penetration.part} lie inside {penetration.other}, by up "
+        f"to {penetration.depth_mm:.1f} mm; the parts of a subject do not."
+        for penetration in found
+        if penetration.depth_mm > fitted.evidence.posterior_error_mm
     ]
 
 

@@ -192,7 +192,7 @@ class Articulation:
         """Return tangent vertices of one part in its own frame, without its motion.
 
         Args:
-            tangent: (3V,) tangent vertices, or (3V, K) displacements of them, mm.
+            tangent: (3V,) tangent vertices, or (3V, K) displacements, mm.
             part: index of the part.
 
         Returns:

@@ -34,7 +34,7 @@ class RegionPrediction:
     """Ridge regression of the coefficients of a model on those of a part, in the training shapes (S10).
 
     All modes of a part determine those of the complete model in the training set, but not in new subjects, since a part
-    does not determine its relative pose. So the ridge is that of the smallest error of left-out training shapes.
+    does not determine its relative pose. So the ridge is that of the smallest error of held-out training shapes.
 
     Args:
         scores: (n, K') coefficients of the part, mm, about their mean.
@@ -65,7 +65,7 @@ class RegionPrediction:
         return RegionPrediction(scores, coefficients, best, ridge)
 
     def shifts(self, score: FloatArray) -> FloatArray:
-        """Return the changes (n, K) of the prediction from `score` (K',) if each shape is left out in turn."""
+        """Return the changes (n, K) of the prediction from `score` (K',) if each shape is held out in turn."""
         precision = self.scores.T @ self.scores + self.ridge * np.eye(self.scores.shape[1])
         influence = 1.0 / len(self.scores) + self.scores @ np.linalg.solve(precision, score)
         return influence[:, None] * self.errors
@@ -131,8 +131,8 @@ def _in_own_frame(full: ShapeModel, articulation: Articulation, inside: BoolArra
     part = articulation.part_with(inside)
     if part is None:
         raise InputError(
-            f"The relative pose of {', '.join(full.parts)} is modelled, so a region lies in one of them; give one of "
-            "these parts, or vertices of one of them."
+            f"The relative pose of {', '.join(full.parts)} is modelled, so a region lies in one part; give one of these "
+            "parts, or vertices of a single part."
         )
     own = inside[articulation.slices[part]]
     mean, modes = articulation.shape_of_part(full.vector(), part), articulation.shape_of_part(full.basis, part)

@@ -1,7 +1,7 @@
 """Prediction of the other parts of a subject, and of their relative pose, from a scan of one part (S9, S10).
 
 A part does not determine its relative pose, so the parts that a scan does not show are predicted by a regression on the
-shape of the part, whose errors are those of training shapes that are left out. Equation numbers are those of
+shape of the part, whose errors are those of training shapes that are held out. Equation numbers are those of
 docs/structures.md.
 """
 
@@ -49,7 +49,7 @@ class PartPrediction:
         region: the part that the scan shows.
         score: (K',) coefficients of the part, mm.
         own: (V', 3) vertices of the part in its own frame, mm.
-        prediction: prediction of the coefficients, with the errors of left-out training shapes.
+        prediction: prediction of the coefficients, with the errors of held-out training shapes.
     """
 
     T_scan_model: Similarity
@@ -98,14 +98,14 @@ class PartPrediction:
         Args:
             missing: (V,) True where the scan shows nothing.
         """
-        model, left = self.model, self.prediction
-        shapes = np.stack([model.reconstruct(c) for c in left.coefficients])
+        model, known = self.model, self.prediction
+        shapes = np.stack([model.reconstruct(c) for c in known.coefficients])
         errors, mean_errors = np.empty_like(shapes), np.empty_like(shapes)
-        for i, c in enumerate(left.coefficients):
+        for i, c in enumerate(known.coefficients):
             own = self._articulation.shape_of_part(model.vector(c), self._part)[:, :, 0]
-            errors[i] = self._placed(c + left.errors[i], own, shapes[i]) - shapes[i]
+            errors[i] = self._placed(c + known.errors[i], own, shapes[i]) - shapes[i]
             mean_errors[i] = self._on_part(model.mean_vertices, shapes[i]) - shapes[i]
-        shifts = np.stack([self._moved(self.b + shift) for shift in left.shifts(self.score)])
+        shifts = np.stack([self._moved(self.b + shift) for shift in known.shifts(self.score)])
         return SurfaceCalibration(
             shapes.astype(np.float32), errors.astype(np.float32), mean_errors.astype(np.float32), shifts, missing, True
         )
