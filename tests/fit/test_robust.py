@@ -11,14 +11,14 @@ from shapespace.errors import FitError, InputError
 from shapespace.fit.fit_scan import FitConfig, fit_scan
 from shapespace.fit.method_choices import method_named
 from shapespace.fit.robust.matching import Matcher, MatchHint, match_vertices
-from shapespace.fit.robust.posterior import Estimate, small_similarity
+from shapespace.fit.robust.posterior import Estimate
 from shapespace.fit.robust.prepared_model import LinearShape, ModelSurface, prepare
 from shapespace.fit.robust.robust_icp import Iterate, Problem, in_span
 from shapespace.fit.robust.robust_settings import Level, RobustSettings
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.geometry.closest import build_engine, on_boundary
 from shapespace.geometry.normals import vertex_normals
-from shapespace.geometry.similarity import POSE
+from shapespace.geometry.similarity import POSE, small_similarity
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Mesh, Similarity
 from synthetic_shapes import blob_model, raw_scan, similarity, training_meshes

@@ -55,9 +55,10 @@ def test_new_subjects_are_nearer_to_a_model_of_relative_pose_than_to_one_of_vert
     assert np.mean(errors_mm(modelled, subjects[30:])) < 0.4 * np.mean(errors_mm(kept, subjects[30:]))
 
 
-def test_a_model_of_relative_pose_gives_its_training_shapes_and_coefficients_back(tmp_path: Path) -> None:
+@pytest.mark.parametrize("gauge", ["form", "shape"])
+def test_a_model_of_relative_pose_gives_its_training_shapes_and_coefficients_back(tmp_path: Path, gauge: str) -> None:
     subjects = make_subjects(20, seed=2)
-    model = build(subjects, gauge="form")
+    model = build(subjects, gauge=gauge)
     assert max(errors_mm(model, subjects)) < 1e-3
     b = model.sample(1, 3)[0]
     assert np.allclose(model.project(model.reconstruct(b)), b, atol=1e-6)

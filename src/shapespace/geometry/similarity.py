@@ -6,6 +6,8 @@ misprints and their corrections.
 
 from __future__ import annotations
 
+from math import cos, sin, sqrt
+
 import numpy as np
 
 from shapespace.errors import InputError
@@ -17,6 +19,8 @@ _NO_ROTATION = "The matched points are on a line or coincide, so they determine 
 
 POSE = 7
 """Number of pose parameters, which precede the coefficients: rotation, translation, scale."""
+SCALE = 6
+"""Index of the log scale among the pose parameters: rotation 0-2, translation 3-5."""
 
 
 def fit_similarity(
@@ -105,3 +109,21 @@ def small_poses(x: FloatArray) -> FloatArray:
     pose[:, :, 3:6] = np.eye(3)
     pose[:, :, 6] = x
     return pose.reshape(-1, POSE)
+
+
+def small_similarity(delta: FloatArray) -> Similarity:
+    """Return S of R3 from `delta` (7,): omega (radians), tau (mm) and ds, about the origin."""
+    x, y, z = delta[:3].tolist()
+    angle = sqrt(x * x + y * y + z * z)
+    # The unit quaternion of the rotation, by a series where the quotient loses precision.
+    squared = angle * angle
+    half = 0.5 - squared / 48 + squared * squared / 3840 if angle <= 1e-3 else sin(angle / 2) / angle
+    x, y, z, w = x * half, y * half, z * half, cos(angle / 2)
+    rotation = np.array(
+        [
+            [x * x - y * y - z * z + w * w, 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), -x * x + y * y - z * z + w * w, 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), -x * x - y * y + z * z + w * w],
+        ]
+    )
+    return Similarity(float(np.exp(delta[SCALE])), rotation, delta[3:6])

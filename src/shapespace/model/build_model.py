@@ -428,7 +428,9 @@ def _model_of_components(
     mean = coder.decode(pc.mean)
     spurious = below_precision(pc.variance, pc.n_samples, mean.size, rounding)
     if align:
-        spurious |= made_by_alignment(mean, coder.directions(pc.basis), gauge, alignment_vertices)
+        # The size of several parts is not that of their vertices about the centroid of all.
+        tangent = "form" if isinstance(coder, Articulated) else gauge
+        spurious |= made_by_alignment(mean, coder.directions(pc.basis), tangent, alignment_vertices)
     if spurious.all():
         raise InputError(
             "The training meshes differ only by their alignment and their rounding, so there is no variation to model; "

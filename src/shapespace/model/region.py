@@ -131,8 +131,8 @@ def _in_own_frame(full: ShapeModel, articulation: Articulation, inside: BoolArra
     part = articulation.part_with(inside)
     if part is None:
         raise InputError(
-            f"The relative pose of {', '.join(full.parts)} is modelled, so a region lies in one part; give one of these "
-            "parts, or vertices of a single part."
+            f"The relative pose of {', '.join(full.parts)} is modelled, so a region lies in one part; give one of "
+            "these parts, or vertices of a single part."
         )
     own = inside[articulation.slices[part]]
     mean, modes = articulation.shape_of_part(full.vector(), part), articulation.shape_of_part(full.basis, part)

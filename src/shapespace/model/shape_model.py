@@ -19,7 +19,7 @@ from shapespace.formats.model_parts import LinearModel
 from shapespace.geometry.articulation import Articulation
 from shapespace.geometry.normals import without_estimates
 from shapespace.geometry.procrustes import Gauge
-from shapespace.geometry.similarity import fit_similarity
+from shapespace.geometry.similarity import POSE, fit_similarity, small_poses, small_similarity
 from shapespace.io.interop import MeshLike
 from shapespace.lazy import OpenViewer, lazy_import
 from shapespace.model import model_file
@@ -33,6 +33,7 @@ from shapespace.types import (
     FloatArray,
     IntArray,
     Mesh,
+    Similarity,
     SurfaceLandmarks,
     generator_of,
     read_only,
@@ -418,6 +419,8 @@ class ShapeModel:
             raise InputError("A shape to be projected must be finite, except for missing vertices (nan).")
         if not align:
             return self.nearest(vertices)
+        if not self.is_linear:
+            return self.nearest_in_any_pose(vertices, with_scale=self.gauge == "shape")[0]
         b, Q = np.zeros(self.n_modes), self.mean_vertices
         used = slice(None) if is_observed.all() else is_observed  # a mask copies
         for _ in range(_PROJECTION_ITERATIONS):
@@ -441,7 +444,9 @@ class ShapeModel:
             noise: s, the variance of a coordinate outside the modes, mm^2; None for `noise_variance`.
         """
         if not self.is_linear:
-            return self._nearest_of_parts(vertices, modes, noise)
+            return self.nearest_in_any_pose(
+                vertices, with_scale=False, posed=False, noise=noise, stddev=self.stddev[:modes]
+            )[0]
         off, modes_used = vertices - self.mean_vertices, self._vertex_modes[:modes]
         if not np.isnan(vertices).any():
             return modes_used @ off.reshape(-1)
@@ -451,22 +456,47 @@ class ShapeModel:
         precision = seen @ seen.T + np.diag(noise / self.stddev[:modes] ** 2)
         return np.asarray(np.linalg.solve(precision, seen @ off[is_observed].reshape(-1)), dtype=np.float64)
 
-    def _nearest_of_parts(self, vertices: FloatArray, modes: int | None, noise: float | None) -> FloatArray:
-        """Return `nearest` by Gauss-Newton steps from the mean, since the vertices are not linear in b (S8)."""
-        variance = self.stddev[:modes] ** 2
+    def nearest_in_any_pose(
+        self, vertices: FloatArray, *, with_scale: bool, posed: bool = True, noise: float | None = None,
+        stddev: FloatArray | None = None,
+    ) -> tuple[FloatArray, Similarity]:  # fmt: skip
+        """Return coefficients (k,) mm and pose of the nearest shape, by Gauss-Newton steps on both (S8).
+
+        Alternation of pose and coefficients is slow if vertices are not linear in the coefficients.
+
+        Args:
+            vertices: (V, 3) vertices, mm; not-a-number where missing.
+            with_scale: whether the scale of the pose is free.
+            posed: whether to estimate the pose; False if the vertices are in the model's frame.
+            noise: variance of a coordinate outside the modes, mm^2, with the prior of the coefficients; None without
+                the prior, or `noise_variance` if vertices are missing.
+            stddev: (k,) standard deviations of the prior, mm; None for those of all modes.
+        """
+        stddev = self.stddev if stddev is None else stddev
         is_observed: BoolArray = ~np.logical_or.reduce(np.isnan(vertices), axis=1)
-        some = not is_observed.all()
-        noise = max(self.noise_variance, _LEAST_NOISE * variance[0]) if noise is None else noise
-        damping = np.diag(noise / variance) if some else np.zeros((len(variance), len(variance)))
-        b = np.zeros(len(variance))
+        if noise is None:
+            noise = 0.0 if is_observed.all() else max(self.noise_variance, _LEAST_NOISE * stddev[0] ** 2)
+        free, k = (POSE if with_scale else POSE - 1) if posed else 0, len(stddev)
+        seen, T = vertices[is_observed], Similarity.identity()
+        if posed:
+            T = fit_similarity(self.mean_vertices[is_observed], seen, with_scale=with_scale)
+        b, precision = np.zeros(k), noise / stddev**2
         for _ in range(_PROJECTION_ITERATIONS):
-            rows = self.directions(b)[:, :modes].reshape(self.n_vertices, 3, -1)[is_observed].reshape(-1, len(b))
-            off = (vertices - self.reconstruct(b))[is_observed].reshape(-1)
-            step = np.linalg.solve(rows.T @ rows + damping, rows.T @ off - damping @ b)
-            b = b + step
-            if np.abs(step).max() <= _PROJECTION_TOLERANCE * self.stddev[0]:
+            x = self.reconstruct(b)
+            moves = np.column_stack([small_poses(x)[:, :free], self.directions(b)[:, :k]])
+            rows = moves.reshape(len(x), 3, -1)[is_observed].reshape(3 * len(seen), -1)
+            pull = rows.T @ (T.inverse().apply(seen) - x[is_observed]).ravel()
+            pull[free:] -= precision * b
+            normal = rows.T @ rows
+            normal[free:, free:] += np.diag(precision)
+            unit = 1.0 / np.sqrt(normal.diagonal())
+            step = unit * np.linalg.solve(normal * np.outer(unit, unit), unit * pull)
+            if posed:
+                T = T @ small_similarity(np.pad(step[:free], (0, POSE - free)))
+            b = b + step[free:]
+            if np.abs(step[free:]).max() <= _PROJECTION_TOLERANCE * self.stddev[0]:
                 break
-        return b
+        return b, T
 
     def to_z(self, b: npt.ArrayLike) -> FloatArray:
         """Return coefficients z (..., k), in standard deviations, of `b` (..., k) in mm; k is at most K."""

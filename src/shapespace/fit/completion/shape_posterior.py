@@ -20,10 +20,8 @@ from shapespace.fit.robust.matching import Matcher, MatchHint, choose_bulging
 from shapespace.fit.robust.posterior import (
     NOISE_TEMPERATURE,
     PATCHES,
-    SCALE,
     Estimate,
     lack_of_new_shapes,
-    small_similarity,
     variance_of_new_shapes,
 )
 from shapespace.fit.robust.prepared_model import (
@@ -38,7 +36,7 @@ from shapespace.fit.robust.robust_settings import Level, RobustSettings
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.geometry.closest import build_engine, on_boundary
 from shapespace.geometry.normals import boundary_vertices, rms_size
-from shapespace.geometry.similarity import POSE, small_poses
+from shapespace.geometry.similarity import POSE, SCALE, small_poses, small_similarity
 from shapespace.model.new_shapes import variances_of_new_shapes
 from shapespace.model.shape_model import ShapeModel
 from shapespace.model.training_shapes import MOST_SHAPES

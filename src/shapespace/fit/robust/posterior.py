@@ -10,7 +10,6 @@ Equation numbers are those of docs/robust.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import cos, sin, sqrt
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
@@ -20,7 +19,7 @@ from shapespace.fit.robust.kernels import rows_into
 from shapespace.fit.robust.matching import Gathered, Weights
 from shapespace.fit.robust.prepared_model import ModelSurface, worth
 from shapespace.geometry.normals import rms_size
-from shapespace.geometry.similarity import POSE, small_poses
+from shapespace.geometry.similarity import POSE, SCALE, small_poses, small_similarity
 from shapespace.io.memory_cache import cached_with_owner
 from shapespace.model.new_shapes import variances_of_new_shapes, whole_spectrum
 from shapespace.model.shape_model import ShapeModel
@@ -28,8 +27,6 @@ from shapespace.types import FloatArray, Similarity, SurfaceLandmarks
 
 _DAMPING = 1e-7
 """Added to the unit diagonal of R15a; far below the precision of the float32 rows."""
-SCALE = 6
-"""Index of the log scale among the pose parameters: rotation 0-2, translation 3-5."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,24 +143,6 @@ def normal_equations(
         gradient[SCALE] += D[SCALE] * np.log(estimate.T_scan_model.scale / prior.start_scale)
     H = np.asarray(rows[:count].T @ rows[:count], dtype=np.float64)  # R12
     return NormalEquations(H, D, gradient, prior.holds_scale)
-
-
-def small_similarity(delta: FloatArray) -> Similarity:
-    """Return S of R3 from `delta` (7,): omega (radians), tau (mm) and ds, about the origin."""
-    x, y, z = delta[:3].tolist()
-    angle = sqrt(x * x + y * y + z * z)
-    # The unit quaternion of the rotation, by a series where the quotient loses precision.
-    squared = angle * angle
-    half = 0.5 - squared / 48 + squared * squared / 3840 if angle <= 1e-3 else sin(angle / 2) / angle
-    x, y, z, w = x * half, y * half, z * half, cos(angle / 2)
-    rotation = np.array(
-        [
-            [x * x - y * y - z * z + w * w, 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), -x * x + y * y - z * z + w * w, 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), -x * x - y * y + z * z + w * w],
-        ]
-    )
-    return Similarity(float(np.exp(delta[SCALE])), rotation, delta[3:6])
 
 
 # Chosen on the split "dev" of `benchmarks/calibration.py`, so that intervals of 68 % and 95 % contain these shares.

@@ -48,7 +48,6 @@ from shapespace.fit.robust.posterior import (
     lack_of_new_shapes,
     normal_equations,
     posterior,
-    small_similarity,
     variance_of_new_shapes,
 )
 from shapespace.fit.robust.prepared_model import (
@@ -65,7 +64,7 @@ from shapespace.fit.search.initialisation import Start
 from shapespace.geometry.closest import on_boundary
 from shapespace.geometry.kdtree import KdTree
 from shapespace.geometry.normals import rms_size
-from shapespace.geometry.similarity import POSE, small_poses
+from shapespace.geometry.similarity import POSE, small_similarity
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, IntArray, Similarity
 
@@ -632,9 +631,10 @@ def in_span(
         with_scale: whether the scale is free; False keeps the scale.
     """
     if not prepared.model.is_linear:
-        return _in_span_of_parts(
-            prepared.model, vertices, estimate, prior_stddev[:modes], uncertainty_mm, with_scale=with_scale
+        b, pose = prepared.model.nearest_in_any_pose(
+            vertices, with_scale=with_scale, noise=uncertainty_mm**2 / 3.0, stddev=prior_stddev[:modes]
         )
+        return Estimate(estimate.T_scan_model @ pose, b)
     P, free = prepared.model.vertex_basis[:, :modes], POSE if with_scale else POSE - 1
     pose, inside = prepared.pose[:, :free], prepared.pose_in_span[:modes, :free]
     noise = uncertainty_mm**2 / 3.0
@@ -651,30 +651,3 @@ def in_span(
     small = small_similarity(delta)
     y = (small.inverse().apply(vertices) - prepared.model.mean_vertices).ravel()
     return Estimate(estimate.T_scan_model @ small, kept_share * (P.T @ y))  # R19
-
-
-_SPAN_ROUNDS, _SPAN_STILL = 20, 1e-6
-"""Limit of the steps of the projection of several parts, and the step, in standard deviations, that ends them."""
-
-
-def _in_span_of_parts(
-    model: ShapeModel, vertices: FloatArray, estimate: Estimate, stddev: FloatArray, uncertainty_mm: float,
-    *, with_scale: bool,
-) -> Estimate:  # fmt: skip
-    """Return `in_span` of a model whose vertices are not linear in the coefficients, by Gauss-Newton steps."""
-    free, k = POSE if with_scale else POSE - 1, len(stddev)
-    noise = uncertainty_mm**2 / 3.0
-    pose, b = Similarity.identity(), estimate.b[:k].copy()
-    for _ in range(_SPAN_ROUNDS):
-        x = model.reconstruct(b)
-        rows = np.column_stack([small_poses(x)[:, :free], model.directions(b)[:, :k]])
-        off = (pose.inverse().apply(vertices) - x).ravel()
-        normal, pull = rows.T @ rows, rows.T @ off
-        normal[free:, free:] += np.diag(noise / stddev**2)
-        pull[free:] -= noise * b / stddev**2
-        unit = 1.0 / np.sqrt(normal.diagonal())
-        step = unit * np.linalg.solve(normal * np.outer(unit, unit), unit * pull)
-        pose, b = pose @ small_similarity(np.pad(step[:free], (0, POSE - free))), b + step[free:]
-        if float(np.abs(step[free:] / stddev).max()) < _SPAN_STILL:
-            break
-    return Estimate(estimate.T_scan_model @ pose, b)
