@@ -225,7 +225,7 @@ def _part_tables(result: CompareResult) -> Iterator[ResultTable]:
         note=f"Change of least-squares means from low to high. {axes}.",
         columns=(Column("from, to", field="change"), Column("joint", field="joint"), *numbers),
         rows=[
-            (label, joint, *(np.round(values, _POSE_DECIMALS) + 0.0))
+            (label, joint, *(np.round(values, _POSE_DECIMALS) + 0.0).tolist())
             for label, change in pose_changes(result).items()
             for joint, values in zip(poses.joints, change, strict=True)
         ],
