@@ -42,6 +42,7 @@ DEMO = Source("demo", "run_demo")
 FACES = Source("commands.data", "write_simulated_faces")
 ORGANS = Source("commands.data", "write_simulated_organs")
 BONES = Source("commands.data", "write_simulated_bones")
+JOINTS = Source("commands.data", "write_simulated_joints")
 SKULLS = Source("commands.data", "write_simulated_landmarks")
 SURFACE = Source("commands.surface", "write_surfaces")
 GROOMING = Source("geometry.grooming", "Grooming")
@@ -319,6 +320,20 @@ COMMANDS: tuple[CommandSpec, ...] = (
         (
             "The bones are small skulls, in mm, each with its own triangles and pose; every third scan has a hole. "
             "bones.csv has the columns file and group.",
+        ),
+    ),
+    CommandSpec(
+        "data joints", "write simulated joints: raw scans of two bones per subject (PLY), and their table joints.csv",
+        ("shapespace data joints -o knees --count 16",), "commands.data:write_simulated_joints",
+        (
+            _OUTPUT,
+            basic("--count", "N", source=JOINTS, parse=values.positive),
+            basic("--effect", "DEGREES", source=JOINTS, field="effect_degrees"),
+            basic("--seed", "S", source=JOINTS),
+        ),
+        (
+            "The bones of a subject, NAME_femur.ply and NAME_tibia.ply, are in one frame, in mm. joints.csv has the "
+            "columns specimen and group; the flexion of the second group is larger.",
         ),
     ),
     CommandSpec(

@@ -128,6 +128,29 @@ def write_simulated_bones(
     return _write_about(output, "bone", count, f"{count} simulated bones of shapespace in two groups, seed {seed}")
 
 
+def write_simulated_joints(
+    output: Path, *, count: int = 16, seed: int = 0, effect_degrees: float = 12.0, quiet: bool = False
+) -> Outcome:
+    """Write raw scans of simulated joints of two bones, and their table.
+
+    Args:
+        output: output folder.
+        count: number of subjects; the groups alternate.
+        seed: random seed; subject k of a seed is the same for every count.
+        effect_degrees: difference of the mean flexion between the two groups in degrees, at most 60.
+        quiet: no progress.
+
+    Raises:
+        InputError: a count or an effect out of range.
+        FileError: the folder cannot be written.
+    """
+    from shapespace.datasets.joints import write_joints
+
+    with progress(count, "writing", "subject", quiet=quiet) as bar:
+        write_joints(output, count=count, seed=seed, effect_degrees=effect_degrees, progress=bar.update)
+    return _write_about(output, "joint", count, f"{count} simulated joints of shapespace in two groups, seed {seed}")
+
+
 def write_simulated_landmarks(output: Path, *, count: int = 40, seed: int = 0) -> Outcome:
     """Write simulated landmarks of skulls of two species at two sites (TPS, 2-D), and their table.
 

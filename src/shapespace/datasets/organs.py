@@ -108,13 +108,19 @@ class Star(Protocol):
 
 def raw_surface(organ: Star, rng: np.random.Generator, points: int = _POINTS) -> Mesh:
     """Return `organ` as a scan: triangles and pose of its own, and noise; mm."""
+    mesh = raw_surface_in_its_frame(organ, rng, points)
+    return mesh.with_vertices(random_similarity(rng, 180.0, (1.0, 1.0)).apply(mesh.vertices))
+
+
+def raw_surface_in_its_frame(organ: Star, rng: np.random.Generator, points: int = _POINTS) -> Mesh:
+    """Return `organ` with triangles of its own and noise, in the frame of the organ, mm."""
     directions = _spread(points) @ Rotation.random(random_state=rng).as_matrix().T
     faces = ConvexHull(directions).simplices.astype(np.int32)
     a, b, c = (directions[faces[:, k]] for k in range(3))
     inward = np.einsum("fd,fd->f", np.cross(b - a, c - a), a) < 0
     faces[inward] = faces[inward][:, ::-1]
     x = organ.surface(directions) + _NOISE_MM * rng.standard_normal((points, 3))
-    return Mesh(random_similarity(rng, 180.0, (1.0, 1.0)).apply(x), faces, name="organ")
+    return Mesh(x, faces, name="organ")
 
 
 def label_volume(organ: Organ, rng: np.random.Generator) -> LabelVolume:
