@@ -23,6 +23,7 @@ PAGES = {
     "data list": ["data.md"],
     "data organs": ["data.md"],
     "data bones": ["data.md", "tutorial-bones.md"],
+    "data joints": ["structures.md"],
     "data landmarks": ["data.md", "tutorial-landmarks.md"],
     "surface": ["volumes.md", "tutorial-volumes.md"],
     "check": ["mesh-formats.md"],

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 import shapespace as ss
 from jointed_parts import FLEXION, PARTS, knees, sexes
 from shapespace.cohort.cohort import Cohort, FitDiagnostics
-from shapespace.cohort.parts import RELATIVE_POSE, cohort_of_part, cohort_of_poses, relative_poses
+from shapespace.cohort.part_cohorts import RELATIVE_POSE, cohort_of_part, cohort_of_poses, relative_poses
 from shapespace.cohort.table import Table
 from shapespace.errors import InputError
 from shapespace.geometry.procrustes import Gauge, centroid_size

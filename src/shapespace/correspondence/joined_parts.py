@@ -53,7 +53,7 @@ def join_parts(parts: Mapping[str, Correspondence], *, doubts: Mapping[str, str]
     Example:
         >>> config = ss.CorrespondConfig(vertices=200, rounds=1, mirror="never")
         >>> correspondence = ss.correspond(meshes[:3], config)
-        >>> list(ss.join_parts({"left": correspondence, "right": correspondence}).parts)
+        >>> list(ss.correspondence.join_parts({"left": correspondence, "right": correspondence}).parts)
         ['left', 'right']
     """
     if len(parts) < 2:

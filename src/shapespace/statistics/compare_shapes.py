@@ -17,7 +17,7 @@ import numpy as np
 from msgspec import structs
 
 from shapespace.cohort.cohort import Cohort, with_columns
-from shapespace.cohort.parts import RELATIVE_POSE, cohorts_of_parts, relative_poses, require_parts
+from shapespace.cohort.part_cohorts import RELATIVE_POSE, cohorts_of_parts, relative_poses, require_parts
 from shapespace.cohort.table import number_caution
 from shapespace.errors import InputError
 from shapespace.geometry.mirror_plane import mirrored_note

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from shapespace.cohort.parts import RELATIVE_POSE, RelativePoses, relative_poses
+from shapespace.cohort.part_cohorts import RELATIVE_POSE, RelativePoses, relative_poses
 from shapespace.statistics.compare_shapes import CompareResult
 from shapespace.statistics.compare_strata import means_of
 from shapespace.types import FloatArray

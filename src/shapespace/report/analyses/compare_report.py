@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.cohort.cohort import Cohort
-from shapespace.cohort.parts import RELATIVE_POSE
+from shapespace.cohort.part_cohorts import RELATIVE_POSE
 from shapespace.report.analyses.analysis_report import (
     AnalysisReport,
     Column,

@@ -16,7 +16,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from shapespace.cohort.cohort import Cohort
-from shapespace.cohort.parts import require_parts, without_relative_pose
+from shapespace.cohort.part_cohorts import require_parts, without_relative_pose
 from shapespace.errors import FileFormatError, InputError
 from shapespace.io.files import read_bytes
 from shapespace.io.read_limits import LARGEST_LANDMARK_FILE_BYTES
