@@ -14,7 +14,7 @@ from itertools import combinations
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from shapespace.correspondence.correspondence_result import ENOUGH_TO_COMPARE, Correspondence, Corresponding
 from shapespace.correspondence.odd_scans import ScanMeasures
@@ -339,7 +339,7 @@ class _PoseCheck:
         for at, (part, parent) in enumerate(self._pairs):
             own = self._values[np.isfinite(self._values[:, at, 0]), at, :3]
             mean = Rotation.from_rotvec(own).as_matrix().mean(axis=0)
-            if len(own) >= ENOUGH_TO_COMPARE and 3 * len(own) * (mean**2).sum() < chi2.isf(_NO_FRAME, 9):
+            if len(own) >= ENOUGH_TO_COMPARE and 3 * len(own) * (mean**2).sum() < chdtri(9, _NO_FRAME):
                 sentences.append(
                     f"{part} has no common pose relative to {parent}, so their scans are probably not in one frame; "
                     "export the parts of a specimen in one frame, or build with --relative-pose removed."

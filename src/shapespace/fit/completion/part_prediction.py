@@ -11,10 +11,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.stats import chi2, f
 
 from shapespace.errors import InputError
-from shapespace.fit.completion.shape_posterior import root_of
+from shapespace.fit.completion.shape_posterior import predictive_covariance, root_of
 from shapespace.fit.completion.surface_calibration import SurfaceCalibration
 from shapespace.fit.iteration_state import MATCHED
 from shapespace.fit.result import FitResult
@@ -27,7 +26,6 @@ from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, Similarity
 
 _DRAWS = 400  # samples of a covariance of vertices on arcs; standard deviations then have an error of 4 %
-_COVERED = 0.95  # share of the regions of vertices for which the covariance is exact
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +79,7 @@ class PartPrediction:
 
     def draw_displacements(self, count: int, rng: np.random.Generator) -> Float32Array:
         """Return (count, V, 3) float32 displacements from the mean surface, mm of the model's frame."""
-        errors = self.prediction.errors
-        root = root_of(errors.T @ errors * (hotelling(len(errors)) / len(errors)))
+        root = root_of(predictive_covariance(self.prediction.errors))
         steps = (root @ rng.standard_normal((root.shape[1], count))).T
         return np.stack([self._moved(self.b + step) for step in steps])
 
@@ -174,8 +171,3 @@ def predict_parts(fit: FitResult, T_mm_scan: Similarity) -> PartPrediction:
         part_error_mm=fit.evidence.posterior_error_mm / T.scale, model=model, region=region, score=score, own=own,
         prediction=prediction,
     )  # fmt: skip
-
-
-def hotelling(n: int) -> float:
-    """Return the factor of a covariance of n errors with which regions of a vertex contain 95 % of new errors (E4)."""
-    return 3 * n / (n - 2) * float(f.ppf(_COVERED, 3, n - 2) / chi2.ppf(_COVERED, 3))

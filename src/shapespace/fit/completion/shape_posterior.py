@@ -387,10 +387,15 @@ class LeftOutErrors:
 
     def covariance(self) -> FloatArray:
         """Return the covariance (P, P) of the predictive distribution of the error (E4)."""
-        n = len(self.errors)
-        # Hotelling's T^2 of one of n errors, so that 95 % regions of a vertex contain it with a probability of 95 %.
-        factor = 3 * n / (n - 2) * float(fdtri(3, n - 2, _COVERED) / (2 * gammaincinv(1.5, _COVERED)))
-        return self.errors.T @ self.errors * (factor / n) + self.noise
+        return predictive_covariance(self.errors) + self.noise
+
+
+def predictive_covariance(errors: FloatArray) -> FloatArray:
+    """Return the covariance (P, P) of a new error, given those of n held-out shapes, (n, P) (E4)."""
+    n = len(errors)
+    # Hotelling's T^2 of one of n errors, so that 95 % regions of a vertex contain it with a probability of 95 %.
+    factor = 3 * n / (n - 2) * float(fdtri(3, n - 2, _COVERED) / (2 * gammaincinv(1.5, _COVERED)))
+    return errors.T @ errors * (factor / n)
 
 
 def root_of(covariance: FloatArray) -> FloatArray:
