@@ -149,7 +149,7 @@ def test_shape_and_pose_are_moved_apart_only_where_poses_are_modelled(page_of, r
         tab.page.get_by_test_id("exploded").fill("25")
         tab.page.wait_for_function("made.view.rests")
         png = tab.shot("parts-exploded", clip=tab.page.locator("#a").bounding_box())
-        same_as_kept("structures-modes.png", png, width=1000)
+        same_as_kept("joint-modes.png", png, width=1000)
     assert tab.complaints == []
 
 
