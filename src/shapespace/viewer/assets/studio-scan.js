@@ -50,7 +50,9 @@
   Studio.Coordinates = function Coordinates({ testid, label, axisLabel, point, size, onsend, onmove }) {
     const [draft, setDraft] = useState(null);
     const typing = useRef(false); // whether the draft is unsent: the answer to an earlier edit must not discard it
-    useEffect(() => { if (!typing.current) setDraft(null); }, [String(point)]);
+    const pending = useRef(0); // edits without an answer: until then the draft is newer than the point
+    const last = useRef(""); // numbers of the last of them
+    useEffect(() => { if (!typing.current && !pending.current) setDraft(null); }, [String(point)]);
     const numbersOf = (texts) => texts.map((text) => (String(text).trim() ? Number(String(text).replace(",", ".")) : NaN));
     const change = (texts) => {
       typing.current = true;
@@ -60,9 +62,13 @@
     const values = draft || point || ["", "", ""], numbers = numbersOf(values);
     const send = async () => {
       typing.current = false;
-      if (!draft || !numbers.every(Number.isFinite) || String(numbers) === String(point)) return;
-      setDraft(null);
+      if (!draft || !numbers.every(Number.isFinite) || String(numbers) === (pending.current ? last.current : String(point))) return;
+      pending.current += 1;
+      last.current = String(numbers);
       await onsend(numbers);
+      pending.current -= 1;
+      if (typing.current || pending.current) return;
+      setDraft(null);
       onmove(null);
     };
     const key = (event, axis) => {
