@@ -225,9 +225,9 @@ def _part_tables(result: CompareResult) -> Iterator[ResultTable]:
         note=f"Change of least-squares means from low to high. {axes}.",
         columns=(Column("from, to", field="change"), Column("joint", field="joint"), *numbers),
         rows=[
-            (label, joint, *(np.round(values, _POSE_DECIMALS) + 0.0).tolist())
+            (label, joint, *np.asarray(np.round(change[k], _POSE_DECIMALS) + 0.0, dtype=np.float64))
             for label, change in pose_changes(result).items()
-            for joint, values in zip(poses.joints, change, strict=True)
+            for k, joint in enumerate(poses.joints)
         ],
         file="pose_changes.csv",
     )
