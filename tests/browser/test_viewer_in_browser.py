@@ -412,7 +412,7 @@ def test_a_link_shows_the_same_and_back_goes_back(open_tab, address: str) -> Non
     other.page.go_back()
     shows_model = f"{PANE}.shadowRoot?.querySelector('[data-testid=value-2]')?.innerText === '\u22121.50'"
     other.until(shows_model)
-    # A view that is about to be written into the address does not replace an address of which the page is told late.
+    # A view that is about to be written into the address does not replace an address whose event comes late.
     other.until(f"{PANE}.dataset.ready === 'true'")
     other.page.evaluate(
         """fits => {

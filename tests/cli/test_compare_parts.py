@@ -21,9 +21,9 @@ def rows_of(path: Path) -> list[dict[str, str]]:
 def test_compare_answers_for_each_part_the_relative_pose_and_all_together(run: Run, tmp_path: Path) -> None:
     table = write_knees(tmp_path / "same", knees(12, seed=1, bend=30.0))
     more = ("--permutations", "60", "--shapes", tmp_path / "same", "--set", "gauge=form")
-    told = run("compare", table, "~ sex", *more, "--json", "-o", tmp_path / "answer")
-    assert told.code == 0, told.err
-    answer, facts = tmp_path / "answer", told.facts
+    result = run("compare", table, "~ sex", *more, "--json", "-o", tmp_path / "answer")
+    assert result.code == 0, result.err
+    answer, facts = tmp_path / "answer", result.facts
     tests = rows_of(answer / "parts.csv")
     assert [row["part"] for row in tests] == ["femur", "tibia", "relative pose"]
     assert float(tests[2]["p_of_all_parts"]) < 0.06 < float(tests[0]["p_of_all_parts"])
@@ -52,9 +52,9 @@ def test_compare_answers_for_each_part_the_relative_pose_and_all_together(run: R
 def test_covariation_takes_the_parts_as_modules(run: Run, tmp_path: Path) -> None:
     table = write_knees(tmp_path / "same", knees(10, seed=2))
     for test in ("integration", "modularity"):
-        told = run("test", test, table, "--shapes", tmp_path / "same", "--permutations", "40", "-o", tmp_path / test)
-        assert told.code == 0, told.err
-        assert "femur – tibia" in told.out + (tmp_path / test / "analysis.json").read_text(encoding="utf-8")
+        result = run("test", test, table, "--shapes", tmp_path / "same", "--permutations", "40", "-o", tmp_path / test)
+        assert result.code == 0, result.err
+        assert "femur – tibia" in result.out + (tmp_path / test / "analysis.json").read_text(encoding="utf-8")
 
 
 def test_a_part_that_is_missing_is_counted_in_the_answer(run: Run, tmp_path: Path) -> None:
@@ -63,24 +63,26 @@ def test_a_part_that_is_missing_is_counted_in_the_answer(run: Run, tmp_path: Pat
     subjects[0].vertices[PARTS["femur"] :] = np.nan
     table = write_knees(tmp_path / "same", subjects)
     more = ("--permutations", "40", "--shapes", tmp_path / "same", "--set", "maps=no", "--json")
-    told = run("compare", table, "~ sex", *more, "-o", tmp_path / "answer")
-    assert told.code == 0, told.err
+    result = run("compare", table, "~ sex", *more, "-o", tmp_path / "answer")
+    assert result.code == 0, result.err
     assert [row["shapes"] for row in rows_of(tmp_path / "answer" / "parts.csv")] == ["10", "9", "9"]
-    assert any("1 of 10 shapes lack tibia and are excluded (s00)" in note for note in told.facts["notes"])
+    assert any("1 of 10 shapes lack tibia and are excluded (s00)" in note for note in result.facts["notes"])
 
 
 def test_impossible_options_have_one_sentence(run: Run, tmp_path: Path) -> None:
     table = write_knees(tmp_path / "same", knees(8, seed=4))
     more = ("--shapes", tmp_path / "same", "-o", tmp_path / "answer")
-    told = run("compare", table, "~ sex", "--pose-axes", "hip,knee,ankle", *more)
-    assert told.code != 0 and "three landmarks" in told.sentence()
+    result = run("compare", table, "~ sex", "--pose-axes", "hip,knee,ankle", *more)
+    assert result.code != 0 and "three landmarks" in result.sentence()
     one = write_knees(tmp_path / "one", knees(8, seed=4), {})
-    told = run("compare", one, "~ sex", "--pose-axes", "0,1,2", "--shapes", tmp_path / "one", "-o", tmp_path / "answer")
-    assert told.code != 0 and "needs shapes of several parts" in told.sentence()
+    result = run(
+        "compare", one, "~ sex", "--pose-axes", "0,1,2", "--shapes", tmp_path / "one", "-o", tmp_path / "answer"
+    )
+    assert result.code != 0 and "needs shapes of several parts" in result.sentence()
     for test, words in (("integration", "or shapes of several parts"), ("modularity", "needs shapes of several parts")):
-        told = run("test", test, one, "--shapes", tmp_path / "one", "-o", tmp_path / "answer")
-        assert told.code != 0 and words in told.sentence()
+        result = run("test", test, one, "--shapes", tmp_path / "one", "-o", tmp_path / "answer")
+        assert result.code != 0 and words in result.sentence()
     other = write_knees(tmp_path / "other", knees(8, seed=4), {"femur": 80, "foot": 50})
-    told = run("compare", other, "~ sex", "--shapes", tmp_path / "other", "-o", tmp_path / "answer")
-    assert told.code != 0 and "have 130 vertices" in told.sentence()
+    result = run("compare", other, "~ sex", "--shapes", tmp_path / "other", "-o", tmp_path / "answer")
+    assert result.code != 0 and "have 130 vertices" in result.sentence()
     assert not (tmp_path / "answer").exists()

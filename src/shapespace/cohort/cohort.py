@@ -661,7 +661,7 @@ class Cohort:
 
 def parts_of_model(model: ShapeModel) -> dict[str, int]:
     """Return the number of vertices of each part of a model of shapes and relative poses; empty for other models."""
-    return {} if model.is_linear else {name: len(model.regions[name]) for name in model.parts}
+    return {} if model.is_linear else model.part_counts
 
 
 def _part_counts(parts: Mapping[str, int]) -> str:

@@ -23,7 +23,7 @@ from shapespace.io.meshes.mesh_io import mesh_files, read_mesh, write_mesh
 from shapespace.model.additive import load_model
 from shapespace.model.foreign import looks_like_model
 from shapespace.model.shape_model import ShapeModel
-from shapespace.report.inputs.subject_parts import part_counts, relative_pose
+from shapespace.report.inputs.subject_parts import relative_pose
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, read, to_json
 from shapespace.store.corresponding import json_of
 from shapespace.store.results import Results, mesh_at, modes_of, results_at
@@ -310,7 +310,7 @@ def _facts_of_parts(model: ShapeModel) -> dict[str, Any]:
         }
         for joint in pose.joints
     }  # fmt: skip
-    return {"parts": part_counts(model), "relative_pose": pose.choice, **({"joints": joints} if joints else {})}
+    return {"parts": model.part_counts, "relative_pose": pose.choice, **({"joints": joints} if joints else {})}
 
 
 def training_shapes_note(model: ShapeModel) -> str:

@@ -106,7 +106,7 @@ class RegionFit:
             # The part has its own frame and its own shape, which the predicted coefficients only approximate.
             own = part.model.reconstruct(fitted.b)
             index = full.articulation.part_with(part.inside)
-            if len(own) == part.inside[full.articulation.slices[index or 0]].size:
+            if index is not None and part.inside[full.articulation.slices[index]].all():
                 shape = full.articulation.decode(full.vector(b).reshape(-1, 3), index, own)
             T_scan_model = T_scan_model @ fit_similarity(shape[part.inside], own, with_scale=False)
         vertices = T_scan_model.apply(shape)

@@ -276,7 +276,7 @@ class FitResult:
         """
         if not self.model.parts:
             raise InputError("The model has no parts; build it from specimens of several parts.")
-        part = np.repeat(np.arange(len(self.model.parts)), [len(self.model.regions[name]) for name in self.model.parts])
+        part = np.repeat(np.arange(len(self.model.parts)), list(self.model.part_counts.values()))
         return part[build_engine(self.surface()).query(self.scan.vertices).vertex].astype(np.int32)
 
     def save(self, folder: str | PathLike[str], name: str = "", *, stages: bool = False) -> Path:

@@ -54,4 +54,4 @@ def find_penetrations(surface: Mesh, parts: Mapping[str, IntArray]) -> list[Pene
         if len(inside):
             depth = float(build_engine(Mesh(surface.vertices, own)).query(inside).distance.max())
             found.append(Penetration(part, other, len(inside) / len(points), depth))
-    return sorted(found, key=lambda one: -one.depth_mm)
+    return sorted(found, key=lambda penetration: -penetration.depth_mm)

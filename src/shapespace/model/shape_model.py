@@ -379,6 +379,11 @@ class ShapeModel:
         return self._coder.is_linear
 
     @property
+    def part_counts(self) -> dict[str, int]:
+        """Number of vertices of each part by its name, in order; empty if the surface is one structure."""
+        return {name: len(self.regions[name]) for name in self.parts}
+
+    @property
     def articulation(self) -> Articulation | None:
         """The parts with their joints, if their relative pose is modelled."""
         return self._coder.parts if isinstance(self._coder, Articulated) else None

@@ -17,7 +17,6 @@ from shapespace.report.analyses.result_report import analysis_report
 from shapespace.report.blocks.blocks import Block, Cell, Head, Notes, Table, Text
 from shapespace.report.blocks.wording import listed, mm, percent, training_text
 from shapespace.report.inputs.saved_fits import Folder, StagedFit
-from shapespace.report.inputs.subject_parts import part_counts
 from shapespace.report.pages.page import Page, template
 from shapespace.report.pages.study_page import ANALYSIS, TITLES, StudyParts
 from shapespace.report.pages.write_html import require_report_extra
@@ -100,7 +99,7 @@ def _draw(names: Mapping[str, str], kind: str, shown: object, options: Mapping[s
 
 def html_of_model(model: ShapeModel) -> str:
     """Return a model for a notebook: its first modes, training data, and licence."""
-    counts = part_counts(model)
+    counts = model.part_counts
     rows = [
         ("Made of", training_text(model)),
         ("Surface", f"{model.n_vertices:,} vertices, {0 if model.faces is None else len(model.faces):,} triangles"),

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from shapespace.errors import InputError
-from shapespace.fit.completion.shape_posterior import predictive_covariance, root_of
+from shapespace.fit.completion.shape_posterior import DRAWS, predictive_covariance, root_of, second_moments
 from shapespace.fit.completion.surface_calibration import SurfaceCalibration
 from shapespace.fit.iteration_state import MATCHED
 from shapespace.fit.result import FitResult
@@ -25,12 +25,10 @@ from shapespace.model.region import ModelRegion, RegionPrediction
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import BoolArray, FloatArray, Similarity
 
-_DRAWS = 400  # samples of a covariance of vertices on arcs; standard deviations then have an error of 4 %
-
 
 @dataclass(frozen=True, eq=False)
 class PartPrediction:
-    """Distribution of all parts given a scan of one part; the attributes are those of `ShapePosterior`.
+    """Distribution of all parts given a scan of one part; its common attributes are as in `ShapePosterior`.
 
     Args:
         T_scan_model: pose, from the model's frame to the scan's mm frame.
@@ -68,14 +66,7 @@ class PartPrediction:
 
     def vertex_covariance(self) -> FloatArray:
         """Return the (V, 3, 3) covariance, mm^2, of each vertex position about the mean surface, from samples."""
-        draws = self._draws.astype(np.float64)
-        own = np.eye(3) * self.part_error_mm**2 / 3.0
-        return np.einsum("nvi,nvj->vij", draws, draws) / len(draws) + own
-
-    def prior_vertex_variance(self) -> FloatArray:
-        """Return the (V,) variance, mm^2, of the vertex positions in the population, for a known pose."""
-        basis = self.model.directions(self.b).reshape(self.model.n_vertices, 3, -1)
-        return np.einsum("vik,k->v", basis**2, self.model.stddev**2)
+        return second_moments(self._draws) + np.eye(3) * self.part_error_mm**2 / 3.0
 
     def draw_displacements(self, count: int, rng: np.random.Generator) -> Float32Array:
         """Return (count, V, 3) float32 displacements from the mean surface, mm of the model's frame."""
@@ -130,7 +121,7 @@ class PartPrediction:
 
     @cached_property
     def _draws(self) -> Float32Array:
-        return self.draw_displacements(_DRAWS, np.random.default_rng(0))
+        return self.draw_displacements(DRAWS, np.random.default_rng(0))
 
     def _moved(self, b: FloatArray) -> Float32Array:
         """Return the displacement (V, 3) of the surface with other coefficients and the same part in the same place."""
@@ -153,8 +144,8 @@ def predict_parts(fit: FitResult, T_mm_scan: Similarity) -> PartPrediction:
     prediction = region.prediction
     if prediction is None:
         raise InputError(
-            "The prediction of other parts needs the training shapes of the model; build it without "
-            "--without-training-shapes."
+            "The prediction of other parts needs the training shapes of a model whose relative pose is modelled; build "
+            "it with --relative-pose modelled, and omit --without-training-shapes."
         )
     inside, articulation = region.inside, model.articulation
     assert articulation is not None and fit.evidence is not None

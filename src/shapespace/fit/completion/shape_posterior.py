@@ -53,7 +53,7 @@ _AMPLITUDES = np.geomspace(1e-4, 100.0, 19)
 _AMPLITUDE_STDDEV, _OF_UNKNOWN_MODEL = 1.0, 3.0
 """Standard deviation of the logarithm of the amplitude, chosen by benchmarks/completion.py on faces and femora; the
 second is for models without a known number of shapes, whose spectrum does not predict the amplitude."""
-_DRAWS = 400  # samples of a covariance of vertices on arcs; standard deviations then have an error of 4 %
+DRAWS = 400  # samples of a covariance of vertices on arcs; standard deviations then have an error of 4 %
 OTHER_SIZE = 4.0  # standard deviations of the training shapes' size
 AS_LIKELY = 3.0  # log density (a factor of 20) within which two explanations of a scan are equally likely
 
@@ -113,8 +113,7 @@ class ShapePosterior:
         If the relative pose of parts is modelled, vertices move on arcs, and it is that of samples about the mean.
         """
         if isinstance(self.shape, ArticulatedShape):
-            draws = self.draw_displacements(_DRAWS, np.random.default_rng(0)).astype(np.float64)
-            return np.einsum("nvi,nvj->vij", draws, draws) / _DRAWS
+            return second_moments(self.draw_displacements(DRAWS, np.random.default_rng(0)))
         rows = self.rows()
         moved = (rows.reshape(-1, rows.shape[2]) @ self.covariance.astype(np.float32)).reshape(rows.shape)
         return np.asarray(np.einsum("vip,vjp->vij", moved, rows), dtype=np.float64)
@@ -388,6 +387,12 @@ class LeftOutErrors:
     def covariance(self) -> FloatArray:
         """Return the covariance (P, P) of the predictive distribution of the error (E4)."""
         return predictive_covariance(self.errors) + self.noise
+
+
+def second_moments(draws: Float32Array) -> FloatArray:
+    """Return the mean products (V, 3, 3), mm^2, of displacements (n, V, 3) of vertices."""
+    exact = draws.astype(np.float64)
+    return np.einsum("nvi,nvj->vij", exact, exact) / len(exact)
 
 
 def predictive_covariance(errors: FloatArray) -> FloatArray:

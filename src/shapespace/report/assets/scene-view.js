@@ -99,7 +99,7 @@
       this._moved();
     }
 
-    /** Put target and extent of the camera on what is visible; return whether there is something. */
+    /** Put target and extent of the camera on what is visible; return whether anything is visible. */
     _enclose(ids, margin, turned) {
       if (!this.works) return false;
       const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];

@@ -59,7 +59,7 @@ from shapespace.report.inputs.saved_fits import (
     StagedFit,
     measured_mm,
 )
-from shapespace.report.inputs.subject_parts import JointSpread, Parts, part_counts, relative_pose
+from shapespace.report.inputs.subject_parts import JointSpread, Parts, relative_pose
 from shapespace.report.pages.page import OrderedPicture, Page
 from shapespace.report.render import thumbnails
 from shapespace.report.render.scene import pack_fit, pack_model, pack_scatter, pack_surfaces
@@ -180,7 +180,7 @@ def _parts_of_model(model: ShapeModel) -> list[Block]:
     of_joints = {joint.part: joint for joint in pose.joints}
     rows = [
         [Cell(name), Cell(f"{count:,}", count), *_cells_of_joint(of_joints.get(name))]
-        for name, count in part_counts(model).items()
+        for name, count in model.part_counts.items()
     ]
     columns = [
         Head("Part"), Head("Vertices", "number"), Head("Joint with"), Head("Rotation, SD in degrees", "number"),

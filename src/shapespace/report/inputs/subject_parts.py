@@ -39,12 +39,7 @@ class Parts:
     @staticmethod
     def of(model: ShapeModel) -> Parts | None:
         """Return the parts of a model; None if it has one structure."""
-        return Parts.of_counts(part_counts(model))
-
-
-def part_counts(model: ShapeModel) -> dict[str, int]:
-    """Return the number of vertices of each part of a model by its name; empty if it has one structure."""
-    return {name: len(model.regions[name]) for name in model.parts}
+        return Parts.of_counts(model.part_counts)
 
 
 @dataclass(frozen=True)
@@ -81,7 +76,7 @@ def articulation_of(model: ShapeModel) -> Articulation:
     """Return the joints of a model of several parts: its own, or else those of its mean shape."""
     if not model.is_linear:
         return Articulated.from_arrays(model.coding).parts
-    return Articulation(model.mean_vertices, list(part_counts(model).values()))
+    return Articulation(model.mean_vertices, list(model.part_counts.values()))
 
 
 def relative_pose(model: ShapeModel) -> RelativePose | None:

@@ -102,7 +102,7 @@
       const element = box.current;
       let ended = false, timer = 0, kept = location.hash;
       const keep = () => {
-        if (ended || !shown.current || location.hash !== kept) return; // the user goes elsewhere, and the page is not told yet
+        if (ended || !shown.current || location.hash !== kept) return; // another address was opened, of which the event is still to come
         Studio.keepPlace({ result, view: view.kind, ...shown.current.place() });
         kept = location.hash;
       };
