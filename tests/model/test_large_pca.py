@@ -1,6 +1,7 @@
 """Principal components of shapes on a disk are those of the same shapes in memory."""
 
 import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -191,6 +192,15 @@ def test_a_run_that_was_stopped_goes_on_with_its_pass(tmp_path: Path, monkeypatc
     assert len(products) == passes[-1] - 2 + 1
 
 
+def traced_peak(function: Callable[[], object]) -> int:
+    """Return the largest number of bytes that Python had allocated during a call."""
+    tracemalloc.start()
+    function()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return peak
+
+
 def test_memory_does_not_grow_with_the_shapes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pca, "EXACT", 10)
     monkeypatch.setattr(spill, "_BLOCK_BYTES", 1 << 20)
@@ -199,10 +209,8 @@ def test_memory_does_not_grow_with_the_shapes(tmp_path: Path, monkeypatch: pytes
         data = np.random.default_rng(0).standard_normal((n, 300)) * np.geomspace(30, 0.1, 300)
         with on_disk(tmp_path, data) as table:
             principal_components(table, 3)  # what scipy loads
-            tracemalloc.start()
-            principal_components(table, 3)
-            peaks.append(tracemalloc.get_traced_memory()[1])
-            tracemalloc.stop()
+            # Other threads of the tests may allocate during one of the runs.
+            peaks.append(min(traced_peak(lambda table=table: principal_components(table, 3)) for _ in range(3)))
     assert peaks[1] < 1.1 * peaks[0]
     assert peaks[1] < 0.5 * data.nbytes
 
