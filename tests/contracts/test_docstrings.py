@@ -4,18 +4,28 @@ import ast
 import builtins
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import shapespace
 
 ROOT = Path(shapespace.__file__).parent
-TREES = {path: ast.parse(path.read_text("utf-8")) for path in sorted(ROOT.rglob("*.py"))}
-CLASSES = {node.name: node for tree in TREES.values() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
 FOREIGN_ERRORS = {"LinAlgError", "np.linalg.LinAlgError", "ArgumentTypeError"}
 ENTRY = re.compile(r"^    (\*{0,2}[\w.]+(?:, \*{0,2}[\w.]+)*)(?:: |:$)")
 REFERENCE = re.compile(r"`(\w+)\.(\w+)(?:\(\))?`")
 
 Documented = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
+
+
+@cache
+def source_trees() -> dict[Path, ast.Module]:
+    return {path: ast.parse(path.read_text("utf-8")) for path in sorted(ROOT.rglob("*.py"))}
+
+
+@cache
+def classes() -> dict[str, ast.ClassDef]:
+    trees = source_trees().values()
+    return {node.name: node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
 
 
 def entries(docstring: str, section: str) -> list[str]:
@@ -54,8 +64,8 @@ def members(node: ast.ClassDef) -> set[str]:
             names |= {name.id for target in targets for name in ast.walk(target) if isinstance(name, ast.Name)}
             names |= {name.attr for target in targets for name in ast.walk(target) if isinstance(name, ast.Attribute)}
     for base in node.bases:
-        if isinstance(base, ast.Name) and base.id in CLASSES:
-            names |= members(CLASSES[base.id])
+        if isinstance(base, ast.Name) and base.id in classes():
+            names |= members(classes()[base.id])
     return names
 
 
@@ -70,16 +80,18 @@ def documented(trees: dict[Path, ast.Module]) -> Iterator[tuple[str, Documented,
 def faults(trees: dict[Path, ast.Module]) -> list[str]:
     """Return a clause for each name in a docstring that is not there."""
     # Modules of commands are named as users type them, which other packages also call their functions.
-    modules = {path.stem: tree for path, tree in TREES.items() if path.parent.name not in ("commands", "answers")}
+    modules = {
+        path.stem: tree for path, tree in source_trees().items() if path.parent.name not in ("commands", "answers")
+    }
     found: list[str] = []
     for place, node, docstring in documented(trees):
         real = arguments(node)
         found += [f"{place} documents {name}" for name in entries(docstring, "Args") if name not in real]
         for error in entries(docstring, "Raises"):
-            if error not in CLASSES and error not in FOREIGN_ERRORS and not hasattr(builtins, error):
+            if error not in classes() and error not in FOREIGN_ERRORS and not hasattr(builtins, error):
                 found.append(f"{place} raises {error}")
         for owner, name in REFERENCE.findall(docstring):
-            if owner in CLASSES and name not in members(CLASSES[owner]) | vars(object).keys():
+            if owner in classes() and name not in members(classes()[owner]) | vars(object).keys():
                 found.append(f"{place} refers to {owner}.{name}")
             if owner in modules and owner != "__init__" and not re.search(rf"\b{name}\b", ast.unparse(modules[owner])):
                 found.append(f"{place} refers to {owner}.{name}")
@@ -87,7 +99,7 @@ def faults(trees: dict[Path, ast.Module]) -> list[str]:
 
 
 def test_docstrings_name_only_arguments_errors_and_members_that_exist() -> None:
-    assert faults(TREES) == []
+    assert faults(source_trees()) == []
 
 
 def test_a_wrong_name_is_found_in_each_part_of_a_docstring() -> None:

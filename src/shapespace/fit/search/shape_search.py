@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shapespace.compiled import compiled
-from shapespace.geometry.kdtree import STACK_SIZE, KdArrays, nearest_one
+from shapespace.geometry.kdtree import NOTED, KdArrays, WarmStart, follow_into
 from shapespace.types import FloatArray, IntArray
 
 
@@ -120,10 +120,15 @@ def shape_search(
     """
     n_modes = len(b)
     size = 7 + n_modes
-    A, g, J, W = np.empty((size, size)), np.empty(size), np.empty((3, size)), np.empty((3, size))
-    stack = np.empty(STACK_SIZE)
+    A, g, J = np.empty((size, size)), np.empty(size), np.empty((3, size))
+    J0, J1, J2 = J[0], J[1], J[2]
     n_model, n_scan = counts[0], counts[1]
-    guess = np.full(n_model + n_scan, -1, dtype=np.int32)
+    n_all = n_model + n_scan
+    best, squared = np.full(n_all, -1, dtype=np.int32), np.empty(n_all)
+    queries, matches = np.empty((n_all, 3)), np.empty((n_all, 3))
+    known = WarmStart(np.full((n_all, NOTED + 1), -1, dtype=np.int32), np.zeros((n_all, 3)), np.zeros(n_all))
+    known_of_model = WarmStart(known.rows[:n_model], known.anchor[:n_model], known.reach[:n_model])
+    known_of_scan = WarmStart(known.rows[n_model:], known.anchor[n_model:], known.reach[n_model:])
     x, q, e, n, y = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     is_scale_fixed = not np.isfinite(scale_precision)
     for step in range(len(radii) + 1):
@@ -131,41 +136,36 @@ def shape_search(
         nu = radii[len(radii) - 1] ** 2 if last else radii[step] ** 2
         A[:], g[:], out[:] = 0.0, 0.0, 0.0
         n_used = 0
-        for i in range(n_model + n_scan):
-            forward = i < n_model
-            if forward:
-                best_index = i
+        for i in range(n_all):
+            if i < n_model:
                 for k in range(3):
-                    x[k] = shape.points[best_index, k]
+                    x[k] = shape.points[i, k]
                     for m in range(n_modes):
-                        x[k] += shape.modes[best_index, k, m] * b[m]
+                        x[k] += shape.modes[i, k, m] * b[m]
                 for k in range(3):
-                    y[k] = scale * (R[k, 0] * x[0] + R[k, 1] * x[1] + R[k, 2] * x[2]) + t[k]
-                j, _ = nearest_one(tree, y[0], y[1], y[2], guess[i], stack)
-                guess[i] = j
-                for k in range(3):
-                    y[k] = tree.points[tree.row_of[j], k] - t[k]
-                for k in range(3):
-                    q[k] = (R[0, k] * y[0] + R[1, k] * y[1] + R[2, k] * y[2]) / scale
+                    queries[i, k] = scale * (R[k, 0] * x[0] + R[k, 1] * x[1] + R[k, 2] * x[2]) + t[k]
             else:
                 for k in range(3):
                     y[k] = scan[i - n_model, k] - t[k]
                 for k in range(3):
-                    q[k] = (R[0, k] * y[0] + R[1, k] * y[1] + R[2, k] * y[2]) / scale
-                for k in range(3):
-                    y[k] = q[k]
+                    queries[i, k] = (R[0, k] * y[0] + R[1, k] * y[1] + R[2, k] * y[2]) / scale
                 # The tree is of the mean, so the query goes back by the last match's displacement.
-                best_index = guess[i]
-                if best_index >= 0:
+                if best[i] >= 0:
                     for k in range(3):
                         for m in range(n_modes):
-                            y[k] -= shape.modes[best_index, k, m] * b[m]
-                best_index, _ = nearest_one(shape.tree, y[0], y[1], y[2], best_index, stack)
-                guess[i] = best_index
-                for k in range(3):
-                    x[k] = shape.points[best_index, k]
-                    for m in range(n_modes):
-                        x[k] += shape.modes[best_index, k, m] * b[m]
+                            queries[i, k] -= shape.modes[best[i], k, m] * b[m]
+        follow_into(tree, queries[:n_model], known_of_model, best[:n_model], squared[:n_model], matches[:n_model])
+        follow_into(shape.tree, queries[n_model:], known_of_scan, best[n_model:], squared[n_model:], matches[n_model:])
+        for i in range(n_all):
+            forward = i < n_model
+            best_index = i if forward else best[i]
+            for k in range(3):
+                y[k] = (matches[i, k] if forward else scan[i - n_model, k]) - t[k]
+                x[k] = shape.points[best_index, k]
+                for m in range(n_modes):
+                    x[k] += shape.modes[best_index, k, m] * b[m]
+            for k in range(3):
+                q[k] = (R[0, k] * y[0] + R[1, k] * y[1] + R[2, k] * y[2]) / scale
             along, total, facing = 0.0, 0.0, 0.0
             for k in range(3):
                 n[k] = shape.normals[best_index, k]
@@ -201,15 +201,13 @@ def shape_search(
                 J[k, 6] = q[k]
             eta = 0.1 if facing > 0 else 1.0
             for p in range(size):
-                dot = n[0] * J[0, p] + n[1] * J[1, p] + n[2] * J[2, p]
-                if facing == 0.0:
-                    dot = 0.0
-                for k in range(3):
-                    W[k, p] = w * (dot * n[k] + eta * J[k, p])
-                g[p] += W[0, p] * e[0] + W[1, p] * e[1] + W[2, p] * e[2]
-            for p in range(size):
+                dot = n[0] * J0[p] + n[1] * J1[p] + n[2] * J2[p]
+                w0 = w * (dot * n[0] + eta * J0[p])
+                w1 = w * (dot * n[1] + eta * J1[p])
+                w2 = w * (dot * n[2] + eta * J2[p])
+                g[p] += w0 * e[0] + w1 * e[1] + w2 * e[2]
                 for r in range(p + 1):
-                    A[p, r] += W[0, p] * J[0, r] + W[1, p] * J[1, r] + W[2, p] * J[2, r]
+                    A[p, r] += w0 * J0[r] + w1 * J1[r] + w2 * J2[r]
         if last:
             out[0] /= n_model
             out[2] /= n_model
