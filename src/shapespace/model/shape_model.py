@@ -384,6 +384,12 @@ class ShapeModel:
         return {name: len(self.regions[name]) for name in self.parts}
 
     @property
+    def part_of_vertex(self) -> IntArray | None:
+        """(V,) index of the part of each vertex; None if the surface is one structure."""
+        index = np.arange(len(self.parts), dtype=np.int32)
+        return np.repeat(index, list(self.part_counts.values())) if self.parts else None
+
+    @property
     def articulation(self) -> Articulation | None:
         """The parts with their joints, if their relative pose is modelled."""
         return self._coder.parts if isinstance(self._coder, Articulated) else None
