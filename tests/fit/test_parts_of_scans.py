@@ -9,6 +9,7 @@ from shapespace.cli import main
 from shapespace.errors import FitError, InputError
 from shapespace.fit.fit_scan import join_scans
 from shapespace.fit.scan_target import ScanTarget
+from shapespace.geometry.contact import find_penetrations
 from shapespace.geometry.normals import part_of
 from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.types import Mesh
@@ -228,6 +229,37 @@ def test_a_linear_model_completes_a_scan_of_one_part(pose) -> None:
     assert is_noted == (pose == "removed")
 
 
+def touching(gap: float, sizes: tuple[float, float], angle: float) -> np.ndarray:
+    """Return two ellipsoids whose ends are `gap` mm apart, the second rotated about its end."""
+    first, second = BALL.vertices * [10.0 * sizes[0], 10.0, 10.0], BALL.vertices * [10.0 * sizes[1], 8.0, 8.0]
+    turned = (second + np.array([10.0 * sizes[1] + gap, 0.0, 0.0])) @ Rotation.from_rotvec(
+        [0.0, 0.0, angle]
+    ).as_matrix().T
+    return np.concatenate([first, turned + np.array([10.0 * sizes[0], 0.0, 0.0])])
+
+
+def test_without_contact_no_part_lies_inside_another_and_the_depths_before_and_after_are_noted() -> None:
+    rng = np.random.default_rng(0)
+    shapes = [
+        Mesh(touching(rng.uniform(0.2, 3.0), tuple(1 + 0.2 * rng.normal(size=2)), 0.2 * rng.normal()), FACES)
+        for _ in range(20)
+    ]
+    pair = ss.build_model(shapes, ss.BuildConfig(parts=COUNTS, gauge="form"))
+    scan = Mesh(touching(-1.5, (1.1, 1.0), 0.1) + 0.05 * rng.normal(size=(324, 3)), FACES, name="pair")
+    parts = pair.vertices_of_parts
+    usual, apart = (ss.fit_scan(pair, scan, ss.FitConfig(ss.fit.Robust(no_contact=no))) for no in (False, True))
+    assert find_penetrations(usual.surface(), parts)[0].depth_mm > 1.0
+    assert any("lie inside" in note for note in usual.notes)
+    left = max((found.depth_mm for found in find_penetrations(apart.surface(), parts)), default=0.0)
+    assert left < 0.1
+    depths = next(note for note in apart.notes if note.startswith("Parts lay inside each other by up to 1."))
+    assert f"{left:.2f} mm after contact was forbidden" in depths
+    # Parts that do not touch are fitted as before.
+    free = Mesh(touching(1.0, (1.1, 1.0), 0.1), FACES, name="free")
+    both = [ss.fit_scan(pair, free, ss.FitConfig(ss.fit.Robust(no_contact=no))) for no in (False, True)]
+    assert np.array_equal(both[0].surface().vertices, both[1].surface().vertices)
+
+
 def test_what_a_part_does_not_give_is_refused_in_one_sentence(model) -> None:
     subject = make_subjects(1, seed=13)[0]
     scan = Mesh(subject.vertices[:162], BALL.faces, name="bone")
@@ -243,3 +275,5 @@ def test_what_a_part_does_not_give_is_refused_in_one_sentence(model) -> None:
     one = ss.build_model(make_subjects(8, seed=0), ss.BuildConfig(gauge="form"))
     with pytest.raises(InputError, match="no parts"):
         ss.fit_scan(one, subject).scan_parts()
+    with pytest.raises(FitError, match=r"one part.*--no-contact"):
+        ss.fit_scan(one, subject, ss.FitConfig(ss.fit.Robust(no_contact=True)))

@@ -115,20 +115,6 @@ class FitJob:
         return structs.replace(self.source(folder), hash=sha256_of_file(file), remote_version=version)
 
 
-def fit_file(
-    job: FitJob,
-    model: ShapeModel,
-    model_file: Path,
-    folder: Path,
-    config: FitConfig,
-    *,
-    stages: bool = False,
-    on_state: Callable[[IcpState], None] | None = None,
-) -> FitRecord:
-    """Fit one scan from its file, write its results into `folder`, and return its record, see `FitWork.do`."""
-    return FitWork.of(model, model_file, folder, on_state).do(FitTask(job, config, stages, resume=False))
-
-
 def publish(result: FitResult, record: FitRecord, name: str, folder: Path, *, stages: bool) -> None:
     """Write the record and the surfaces of a fit together, and remove other files of an earlier fit of that name.
 

@@ -60,6 +60,7 @@ def fit(
     *,
     method: str,
     search: str,
+    no_contact: bool,
     region: str | None,
     landmarks: Path | None,
     again: bool,
@@ -80,6 +81,7 @@ def fit(
         execution: Executor of the fits.
         method: name of the method.
         search: closest points of the method paper; `auto` for the default of the method.
+        no_contact: whether parts must not lie inside each other.
         region: name of a region of the model, or file of its vertices; None for the complete model.
         landmarks: file of the only scan, or folder with a file for each scan, named as the scans; None without
             landmarks, or if a list of scans names the files.
@@ -97,7 +99,9 @@ def fit(
     """
     config = replace(
         config,
-        method=method_named(method, **({} if search == "auto" else {"search": search})),
+        method=method_named(
+            method, **({} if search == "auto" else {"search": search}), **({"no_contact": True} if no_contact else {})
+        ),
         region=read_region(region) if region is not None and Path(region).is_file() else region,
     )
     loaded = ShapeModel.load(model)

@@ -43,7 +43,7 @@ from shapespace.io.interop import MeshLike, as_mesh
 from shapespace.io.landmarks.landmark_io import read_landmarks
 from shapespace.model.region import ModelRegion, articulation_of, relative_pose
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import MM_PER_UNIT, BoolArray, FloatArray, IntArray, Mesh, Similarity, SurfaceLandmarks
+from shapespace.types import MM_PER_UNIT, BoolArray, FloatArray, IntArray, Mesh, Similarity
 from shapespace.version import __version__
 
 if TYPE_CHECKING:
@@ -74,14 +74,6 @@ class RegionFit:
     def state(self, state: IcpState) -> IcpState:
         """Return a state with the coefficients of the complete model."""
         return replace(state, b=self.part.to_b(state.b, self.full))
-
-    def forward_states(self, on_state: Callable[[IcpState], None]) -> Callable[[IcpState], None]:
-        """Return a function that calls `on_state` with the states of the complete model."""
-        return lambda state: on_state(self.state(state))
-
-    def landmarks(self, model: ShapeModel) -> SurfaceLandmarks:
-        """Return the landmarks of `model` that lie in the region."""
-        return model.landmarks.within(self.part.inside)
 
     def fitted(self, fitted: Fitted, modes: int | None) -> Fitted:
         """Return the end of the fit for the complete model, with its first `modes` coefficients; None for all."""
@@ -287,7 +279,7 @@ def fit_scan(
         if config.region is not None or not config.fitting.calibrated:
             raise InputError("Scans of several parts need the robust method and no region; omit these options.")
         scan = join_scans(model, parts, strict=config.strict)
-    scan = as_mesh(scan)
+    scan = as_mesh(cast("MeshLike", scan))
     if "landmarks" in files:
         landmarks = read_landmarks(files["landmarks"])
     landmarks = cast("Mapping[str, FloatArray] | None", landmarks)
@@ -300,11 +292,8 @@ def fit_scan(
         clock.append(time.perf_counter())
         limits = config.limits(model)
         if held is not None:
-            limits, on_state = (
-                replace(limits, modes=None, part=True),
-                None if on_state is None else held.forward_states(on_state),
-            )
-        driven = _run_method(config.fitting.states(own, placed.target, placed.start, limits), placed, on_state)
+            limits = replace(limits, modes=None, part=True)
+        driven = _run_method(config.fitting.states(own, placed.target, placed.start, limits), placed, held, on_state)
         clock.append(time.perf_counter())
         stages = _measure_stages(own, placed, driven, config)
         clock.append(time.perf_counter())
@@ -412,7 +401,9 @@ class _MethodRun:
         return {state.phase: state for state in self.history}
 
 
-def _run_method(states: Generator[IcpState, None, Fitted], placed: _PlacedScan, on_state: OnState | None) -> _MethodRun:
+def _run_method(
+    states: Generator[IcpState, None, Fitted], placed: _PlacedScan, held: RegionFit | None, on_state: OnState | None
+) -> _MethodRun:
     """Return the states and the end of a method.
 
     Raises:
@@ -426,7 +417,7 @@ def _run_method(states: Generator[IcpState, None, Fitted], placed: _PlacedScan, 
                 phase_2_from = time.perf_counter()
             history.append(state)
             if on_state is not None:
-                on_state(state)
+                on_state(state if held is None else held.state(state))
             if state.T_scan_model.scale < _VANISHED * placed.start.T_scan_model.scale:
                 raise FitError(
                     f"{name}: the model shrank to a point, as the plain method does when a large part of the scan is "
@@ -497,8 +488,10 @@ def join_scans(model: ShapeModel, scans: Mapping[str, MeshLike], *, strict: bool
         MeshError: a scan cannot be used.
     """
     if not scans or not set(scans) <= set(model.parts):
-        has = f"the parts {', '.join(model.parts)}" if model.parts else "no parts"
-        raise InputError(f"The scans are of {', '.join(scans) or 'no part'}, and the model has {has}; give its parts.")
+        raise InputError(
+            f"The scans are of {', '.join(scans) or 'no part'}, and the model has the parts "
+            f"{', '.join(model.parts) or '(none)'}; give scans of its parts."
+        )
     meshes, notes = list[Mesh](), list[str]()
     for part, scan in scans.items():
         mesh, findings = repair(as_mesh(scan), strict=strict)
@@ -634,7 +627,7 @@ def _landmark_stddev_mm(
     if fitted.landmark_covariance is None:
         return None
     variance = np.einsum("lii->li", fitted.landmark_covariance).copy()
-    landmarks = model.landmarks if held is None else held.landmarks(model)
+    landmarks = model.landmarks if held is None else model.landmarks.within(held.part.inside)
     if not dense:
         # The surface was projected onto the model's modes, and the projection moves a landmark away from its position.
         in_modes = fitted.T_scan_model.apply(landmarks.interpolate(model.reconstruct(fitted.b)))
@@ -647,7 +640,7 @@ def _note_penetrations(model: ShapeModel, fitted: Fitted) -> list[str]:
     if not model.parts or model.faces is None or fitted.evidence is None:
         return []
     surface = Mesh(fitted.vertices_scan_mm, model.faces)
-    found = find_penetrations(surface, {part: model.regions[part] for part in model.parts})
+    found = find_penetrations(surface, model.vertices_of_parts)
     return [
         f"{100 * penetration.share:.1f} % of the vertices of {penetration.part} lie inside {penetration.other}, by up "
         f"to {penetration.depth_mm:.1f} mm; the parts of a subject do not."

@@ -384,10 +384,15 @@ class ShapeModel:
         return {name: len(self.regions[name]) for name in self.parts}
 
     @property
+    def vertices_of_parts(self) -> dict[str, IntArray]:
+        """Vertices of each part by its name; empty if the surface is one structure."""
+        return {name: self.regions[name] for name in self.parts}
+
+    @property
     def part_of_vertex(self) -> IntArray | None:
         """(V,) index of the part of each vertex; None if the surface is one structure."""
-        index = np.arange(len(self.parts), dtype=np.int32)
-        return np.repeat(index, list(self.part_counts.values())) if self.parts else None
+        counts = list(self.part_counts.values())
+        return np.repeat(np.arange(len(counts), dtype=np.int32), counts) if counts else None
 
     @property
     def articulation(self) -> Articulation | None:

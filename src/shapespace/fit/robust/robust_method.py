@@ -8,6 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from shapespace.errors import FitError
 from shapespace.fit.diagnostics.failure_model import (
     FitEvidence,
     ScanEvidence,
@@ -81,6 +82,8 @@ class Robust(RobustSettings):
             find_second_instance,
         )
 
+        if self.no_contact and not (model.parts or limits.part):
+            raise FitError("The model has one part, which no other part can be in contact with; omit --no-contact.")
         # Joints that turn need more steps; a level still ends as soon as nothing moves.
         more = 1 if model.is_linear else _STEPS_OF_JOINTS
         levels = tuple(replace(level, iterations=more * level.iterations) for level in self.levels)
