@@ -172,6 +172,11 @@ def test_scans_that_are_not_the_parts_of_one_subject_are_named_in_one_sentence(m
             ss.fit_scan(model, wrong)
     with pytest.raises(InputError, match="no region"):
         ss.fit_scan(model, scans, ss.FitConfig(region="upper"))
+    # A given pose avoids the search, and the tibia stays 60 mm from its scan.
+    start = ss.fit_scan(model, scans).T_scan_model
+    moved = {"upper": upper, "lower": lower.with_vertices(lower.vertices + np.array([0.0, 0.0, 60.0]))}
+    fit = ss.fit_scan(model, moved, T_scan_model=start)
+    assert fit.status == "doubtful" and "mm from the scan of it" in fit.reason
 
 
 def test_the_commands_join_the_scans_of_a_subject_by_their_names_or_folders(model, tmp_path, capsys) -> None:
@@ -221,8 +226,8 @@ def test_the_commands_join_the_scans_of_a_subject_by_their_names_or_folders(mode
 def test_a_linear_model_completes_a_scan_of_one_part(pose) -> None:
     linear = ss.build_model(make_subjects(12, seed=0), ss.BuildConfig(parts=COUNTS, gauge="form", relative_pose=pose))
     subject = make_subjects(1, seed=9)[0]
-    config = ss.CompletionConfig(samples=4, with_doubtful=True, fit=ss.FitConfig(region="lower"))
-    found = ss.complete(linear, scans_of(subject)["lower"], config)
+    config = ss.CompletionConfig(samples=4, with_doubtful=True)
+    found = ss.complete(linear, {"lower": scans_of(subject)["lower"]}, config)
     assert np.linalg.norm(found.vertices - subject.vertices, axis=1)[162:].mean() < 0.3
     assert found.observed[162:].mean() > 0.9 and not found.observed[:162].any()
     is_noted = any("mean pose, whose spread is unknown" in note for note in found.notes)

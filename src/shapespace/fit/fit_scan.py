@@ -17,6 +17,7 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from shapespace.errors import FitError, InputError
+from shapespace.fit.diagnostics.reasons import Reason
 from shapespace.fit.diagnostics.verdict import judge
 from shapespace.fit.iteration_state import UNSEEN, Fitted, IcpState
 from shapespace.fit.method import FitOutcome, Limits, Method
@@ -119,6 +120,7 @@ _FAR_OUT = 3.0  # standard deviations; a normal coefficient exceeds them once in
 _FAR_OUT_BY_CHANCE = 0.01  # share of coefficients beyond it up to which there is no note; chance alone gives 0.3 %
 _ALL_BUT_THE_RIM = 0.95  # share of vertices; a complete scan still lacks vertices at its border
 _NO_TRIANGLES = "It has no triangles, so distances are to its points and larger than to the surface that they sample."
+_FAR_AWAY = 5.0  # standard deviations of the residuals; the median of normal ones is 0.7
 _OTHER_FRAME = 6.0
 """Standard deviations of a relative pose in the model, beyond which parts are not in one frame: normal values exceed it
 once in 500 million, and frames that differ by chance do so by far more."""
@@ -300,6 +302,8 @@ def fit_scan(
         size_mm = rms_size(own.mean_vertices) * driven.fitted.T_scan_fitted.scale
         ended = FitOutcome(own, placed.start, driven.fitted, stages, driven.ended, size_mm)
         status, reasons = judge(config.fitting, ended)
+        if far := _parts_far_away(model, placed.scan, driven.fitted, stages["final"]):
+            status, reasons = "doubtful", (*far, *(reasons if status == "doubtful" else ()))
         if held is not None:
             driven = replace(
                 driven,
@@ -581,8 +585,8 @@ def _start_from_parts(
     vertices = np.full(model.mean_vertices.shape, np.nan)
     for part in sure:
         vertices[model.regions[part]] = fits[part].surface().vertices[model.regions[part]]
-    placed = np.where(np.isnan(vertices), model.mean_vertices, vertices / fits[sure[0]].T_scan_model.scale)
-    poses = articulation_of(model).poses_of(placed)
+    scale = fits[sure[0]].T_scan_model.scale
+    poses = articulation_of(model).poses_of(np.where(np.isnan(vertices), model.mean_vertices, vertices / scale))
     for joint, rotation, translation in zip(pose.joints, poses.rotation, poses.translation, strict=True):
         turn_deg, shift_mm = float(np.rad2deg(np.linalg.norm(rotation))), float(np.linalg.norm(translation))
         off = max(turn_deg / joint.rotation_deg, shift_mm / joint.translation_mm)
@@ -592,8 +596,21 @@ def _start_from_parts(
                 f"moved by {shift_mm:.0f} mm from the mean, {off:.0f} standard deviations; give scans of one subject "
                 "in one frame, or fit each part alone."
             )
-    b, T = model.nearest_in_any_pose(vertices, with_scale=with_scale)
+    error_mm = max(fits[part].evidence.expected_error_mm for part in sure) / scale
+    b, T = model.nearest_in_any_pose(vertices, with_scale=with_scale, noise=error_mm**2 / 3.0)
     return Start(T, "parts", float("nan"), b)
+
+
+def _parts_far_away(model: ShapeModel, scan: Mesh, fitted: Fitted, final: Stage) -> list[Reason]:
+    """Return a reason for doubt for each part of a scan with known parts that its fitted surface does not follow."""
+    if scan.parts is None or fitted.evidence is None:
+        return []
+    distance_mm, limit_mm = final.distances.scan_to_model_mm, _FAR_AWAY * fitted.evidence.spread_mm
+    return [
+        Reason.other(f"the fitted {part} is {median_mm:.1f} mm from the scan of it (median)")
+        for k, part in enumerate(model.parts)
+        if (own := scan.parts == k).any() and (median_mm := float(np.median(distance_mm[own]))) > limit_mm
+    ]
 
 
 def _measure_stages(

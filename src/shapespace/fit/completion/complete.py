@@ -344,6 +344,8 @@ def complete(
         raise InputError(
             f"The model was built from {model.n_training} shapes; a completion needs one of at least {_FEWEST_SHAPES}."
         )
+    if isinstance(scan, Mapping) and len(scan) == 1:
+        config = replace(config, fit=config.fit.for_scan(model, f"_{next(iter(scan))}"))
     landmarks = read_landmarks(Path(landmarks)) if isinstance(landmarks, str | PathLike) else landmarks
     if config.fit.region is not None and config.fit.region not in model.parts:
         of_parts = f"one of the parts {', '.join(model.parts)}" if model.parts else "no region"
