@@ -2,11 +2,16 @@
 
     python benchmarks/structures.py                       20 simulated limbs with femur, tibia and fibula
     python benchmarks/structures.py --limbs 60 --vertices 3000
+    python benchmarks/structures.py fits --limbs 12       fits with given parts and with parts that are found
+
 
 Limbs are samples of a published model of the pelvis and the lower limb (../shared/data/lower_limb, for tests only),
 with a knee that is flexed by 0 to 40 degrees. The bones of a limb are raw scans in one frame: each has triangles of its
 own, 0.2 mm of noise, and the limb has any pose and size. `correspond --parts` is compared with each bone alone. The
 error of the relative pose is that of each bone against the femur, by the true places of the vertices.
+
+`fits` builds a model of 60 limbs with true correspondences and fits it to new limbs of which 20 % of the points are
+missing, and whose bones are at most 2 mm apart: to one scan of all bones in any pose, and to one scan per bone.
 """
 
 from __future__ import annotations
@@ -16,6 +21,7 @@ import json
 import tempfile
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,10 +33,12 @@ from shapespace.cli import main as shapespace
 from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
 from shapespace.correspondence.template import clean_scan
 from shapespace.datasets.simulated_scan import random_similarity, simulate_scan
+from shapespace.fit.fit_scan import fit_scan
 from shapespace.geometry.closest import build_engine
-from shapespace.geometry.normals import faces_of
+from shapespace.geometry.normals import faces_of, part_of
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
+from shapespace.model.build_model import BuildConfig, build_model
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import IntArray, Mesh, Similarity
 
@@ -38,6 +46,7 @@ DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "lower_limb"
 BONES = {"femur": "Fem_R", "tibia": "Tib_R", "fibula": "Fib_R"}
 FLEXION_DEG = 40.0
 TRIANGLES, NOISE_MM = 6000, 0.2
+TRAINING, MISSING, HOLE_MM, GAP_MM = 60, 0.2, 25.0, 1.5
 
 
 class Limbs:
@@ -143,15 +152,97 @@ def relative_pose_errors(limbs: Limbs, known: dict[str, list[Known]], same: Path
     }
 
 
+def thinned(mesh: Mesh, count: int) -> tuple[IntArray, IntArray]:
+    """Return vertices of a mesh that are far from each other, and the triangles between them."""
+    chosen = [0]
+    distance = np.linalg.norm(mesh.vertices - mesh.vertices[0], axis=1)
+    while len(chosen) < count:
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(mesh.vertices - mesh.vertices[chosen[-1]], axis=1))
+    faces = cKDTree(mesh.vertices[chosen]).query(mesh.vertices)[1][faces_of(mesh)]
+    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
+    faces = faces[np.sort(np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1])]
+    used = np.unique(faces)
+    return np.array(chosen)[used], np.searchsorted(used, faces).astype(np.int32)
+
+
+def joined(bones: dict[str, Mesh]) -> Mesh:
+    """Return all bones as one mesh."""
+    starts = np.cumsum([0, *(len(bone.vertices) for bone in bones.values())])
+    faces = [faces_of(bone) + start for bone, start in zip(bones.values(), starts, strict=False)]
+    return Mesh(np.concatenate([bone.vertices for bone in bones.values()]), np.concatenate(faces).astype(np.int32))
+
+
+def fits_with_given_and_found_parts(limbs: Limbs, count: int, seed: int, vertices: int) -> dict[str, object]:
+    """Return the share of points that are given to their bone, and the errors of both fits, mm."""
+    thin = {bone: thinned(mesh, vertices) for bone, mesh in limbs.means.items()}
+
+    def coarse(bones: dict[str, Mesh]) -> Mesh:
+        return joined({bone: Mesh(mesh.vertices[thin[bone][0]], thin[bone][1]) for bone, mesh in bones.items()})
+
+    training = [coarse(limbs.draw(np.random.default_rng([seed, 1, k]))) for k in range(TRAINING)]
+    counts = {bone: len(own[0]) for bone, own in thin.items()}
+    model = build_model(training, BuildConfig(parts=counts, gauge="form"))
+    rows: list[dict[str, object]] = []
+    for k in range(count):
+        rng = np.random.default_rng([seed, 2, k])
+        bones = limbs.draw(rng)
+        femur, tibia = (bones[bone].vertices for bone in ("femur", "tibia"))
+        distance, nearest = cKDTree(femur).query(tibia)
+        closest = int(distance.argmin())
+        step = femur[nearest[closest]] - tibia[closest]
+        step = step * max(0.0, 1.0 - GAP_MM / max(float(distance.min()), GAP_MM))
+        for bone in ("tibia", "fibula"):
+            bones[bone] = bones[bone].with_vertices(bones[bone].vertices + step)
+        T = random_similarity(rng, 180.0, (1.0, 1.0))
+        truth = T.apply(coarse(bones).vertices)
+        every = joined(bones).vertices
+        keep = np.ones(len(every), np.bool_)
+        while keep.mean() > 1.0 - MISSING:
+            keep &= np.linalg.norm(every - every[rng.integers(len(every))], axis=1) > HOLE_MM
+        starts = np.cumsum([0, *(len(bone.vertices) for bone in bones.values())])
+        scans: dict[str, Mesh] = {}
+        for (bone, mesh), start in zip(bones.items(), starts, strict=False):
+            noisy = mesh.vertices + NOISE_MM * rng.standard_normal(mesh.vertices.shape)
+            scans[bone] = part_of(
+                Mesh(T.apply(noisy), mesh.faces, name=f"limb{k:02d}_{bone}"), keep[start : start + len(mesh.vertices)]
+            )
+        label = np.repeat(np.arange(len(scans)), [len(scan.vertices) for scan in scans.values()])
+        found, given = fit_scan(model, replace(joined(scans), name=f"limb{k:02d}")), fit_scan(model, scans)
+        near = build_engine(found.surface()).query(joined(scans).vertices).vertex
+        assert model.part_of_vertex is not None
+        error_mm = [
+            float(np.linalg.norm(fit.surface().vertices - truth, axis=1).mean()) for fit in (found, given)
+        ]  # fmt: skip
+        rows.append({
+            "gap_mm": float(min(distance.min(), GAP_MM)), "status": [found.status, given.status],
+            "own_bone": float((model.part_of_vertex[near] == label).mean()),
+            "found_mm": error_mm[0], "given_mm": error_mm[1],
+        })  # fmt: skip
+        print(json.dumps(rows[-1]), flush=True)
+    return {
+        "own_bone": float(np.mean([row["own_bone"] for row in rows])),
+        **{f"{how}_{name}": float(measure([row[how] for row in rows]))
+           for how in ("found_mm", "given_mm") for name, measure in (("mean", np.mean), ("median", np.median))},
+        "ratio_median": float(np.median([row["found_mm"] / row["given_mm"] for row in rows])),  # type: ignore[operator]
+    }  # fmt: skip
+
+
 def main() -> None:
     """Run the benchmark and print its figures as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", nargs="?", choices=("correspondence", "fits"), default="correspondence")
     parser.add_argument("--limbs", type=int, default=20)
     parser.add_argument("--vertices", type=int, default=1500)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--folder", type=Path, help="folder of scans and results (default: a temporary one)")
     asked = parser.parse_args()
     limbs, start = Limbs(), time.perf_counter()
+    if asked.what == "fits":
+        print(
+            json.dumps(fits_with_given_and_found_parts(limbs, asked.limbs, asked.seed, asked.vertices // 3), indent=2)
+        )
+        return
     with tempfile.TemporaryDirectory() as temporary:
         folder: Path = asked.folder or Path(temporary)
         scans, same, alone = folder / "scans", folder / "same", folder / "alone"

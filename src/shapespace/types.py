@@ -128,6 +128,7 @@ class Mesh:
             None if all are observed.
         position_std: (V,) standard deviation of the position of each vertex in any direction along the surface, in the
             unit of `vertices`; None if unknown.
+        parts: (V,) int32 index of the part of a model that each vertex shows; None if unknown.
 
     Raises:
         MeshError: arrays of the wrong shape, or faces that index past the end of the vertices.
@@ -141,6 +142,7 @@ class Mesh:
     notes: tuple[str, ...] = ()
     observed: BoolArray | None = None
     position_std: FloatArray | None = None
+    parts: IntArray | None = None
 
     __repr__ = short_repr
 
@@ -190,6 +192,8 @@ class Mesh:
             if std.shape != vertices.shape[:1]:
                 raise MeshError(f"{self.name}: position_std must have the shape (V,), not {std.shape}.")
             object.__setattr__(self, "position_std", std)
+        if self.parts is not None and self.parts.shape != vertices.shape[:1]:
+            raise MeshError(f"{self.name}: parts must have the shape (V,), not {self.parts.shape}.")
 
     def __getstate__(self) -> dict[str, Any]:
         # For copies, other processes and skops, which do not support read-only mappings.
@@ -210,6 +214,7 @@ class Mesh:
             colours=self.colours,
             notes=self.notes,
             observed=self.observed,
+            parts=self.parts,
         )
 
     @property

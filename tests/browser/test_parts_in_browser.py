@@ -14,7 +14,7 @@ from test_scene_in_browser import SHELL
 import shapespace as ss
 from same_blobs import NAMES, write_same
 from shapespace.geometry.articulation import PartPoses
-from shapespace.report.inputs.subject_parts import articulation_of
+from shapespace.model.region import articulation_of
 from shapespace.report.render import palette, scene
 from shapespace.schemas import CorrespondenceRecord
 from two_parts import VERTICES, two_part_surfaces

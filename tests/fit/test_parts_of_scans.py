@@ -6,7 +6,11 @@ from scipy.spatial.transform import Rotation
 
 import shapespace as ss
 from shapespace.cli import main
-from shapespace.errors import InputError
+from shapespace.errors import FitError, InputError
+from shapespace.fit.fit_scan import join_scans
+from shapespace.fit.scan_target import ScanTarget
+from shapespace.geometry.contact import find_penetrations
+from shapespace.geometry.normals import part_of
 from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.types import Mesh
 
@@ -116,6 +120,151 @@ def test_the_commands_take_the_part_from_the_name_of_the_file(model, tmp_path, c
     capsys.readouterr()
 
 
+def scans_of(subject: Mesh, name: str = "anna") -> dict[str, Mesh]:
+    """Return the scans of both parts, with 0.1 mm of noise."""
+    noisy = subject.vertices + 0.1 * np.random.default_rng(3).normal(size=subject.vertices.shape)
+    return {
+        "upper": Mesh(noisy[:162], BALL.faces, name=f"{name}_upper"),
+        "lower": Mesh(noisy[162:], BALL.faces, name=f"{name}_lower"),
+    }  # fmt: skip
+
+
+def test_scans_of_known_parts_have_one_fit_in_which_each_point_belongs_to_its_part(model) -> None:
+    subject = make_subjects(1, seed=5)[0]
+    scans = scans_of(subject)
+    fit = ss.fit_scan(model, scans)
+    assert fit.status == "converged" and fit.scan_name == "anna" and fit.start == "parts"
+    assert np.linalg.norm(fit.surface().vertices - subject.vertices, axis=1).mean() < 0.1
+    assert np.array_equal(fit.scan_parts(), np.repeat([0, 1], 162))
+    assert fit.overlap_distances.model_seen_share == 1.0
+    # The end of the upper bone beside a lower bone without its own: no point of it belongs to the lower bone.
+    apart = scans["lower"].vertices - subject.vertices[:162].mean(axis=0)
+    piece = part_of(scans["lower"], np.linalg.norm(apart, axis=1) > np.median(np.linalg.norm(apart, axis=1)))
+    partial = ss.fit_scan(model, {"upper": scans["upper"], "lower": piece})
+    assert np.linalg.norm(partial.surface().vertices - subject.vertices, axis=1).mean() < 1.0
+
+
+def test_points_of_one_part_never_match_another_part_even_inside_it(model) -> None:
+    subject = make_subjects(1, seed=5)[0]
+    mesh = join_scans(model, scans_of(subject), strict=False)
+    # Both parts are moved to the same place; each vertex still finds the point of its own part.
+    moved = mesh.with_vertices(
+        mesh.vertices - np.repeat([mesh.vertices[:162].mean(0), mesh.vertices[162:].mean(0)], 162, axis=0)
+    )
+    target = ScanTarget(moved, model.part_of_vertex)
+    near = target.engine.query(moved.vertices + target.vertex_shift(slice(None)))
+    assert np.array_equal(near.vertex, np.arange(324)) and near.distance.max() < 1e-9
+    assert ScanTarget(part_of(moved, np.arange(324) < 162), model.part_of_vertex).shown.sum() == 162
+
+
+def test_scans_that_are_not_the_parts_of_one_subject_are_named_in_one_sentence(model) -> None:
+    scans = scans_of(make_subjects(1, seed=5)[0])
+    upper, lower = scans.values()
+    other_frame = lower.with_vertices(lower.vertices @ Rotation.from_rotvec([0.0, 2.0, 0.0]).as_matrix())
+    for wrong, error, sentence in (
+        ({"upper": lower, "lower": upper}, FitError, "upper and lower|lower and upper"),
+        ({"upper": upper, "lower": upper}, InputError, "upper and lower are the same scan"),
+        ({"upper": upper, "lower": lower.with_vertices(lower.vertices / 10)}, FitError, "lower has another unit"),
+        ({"upper": upper, "lower": other_frame}, FitError, "lower relative to upper is rotated by"),
+        ({"upper": upper, "tibia": lower}, InputError, "the parts upper, lower"),
+    ):
+        with pytest.raises(error, match=sentence):
+            ss.fit_scan(model, wrong)
+    with pytest.raises(InputError, match="no region"):
+        ss.fit_scan(model, scans, ss.FitConfig(region="upper"))
+    # A given pose avoids the search, and the tibia stays 60 mm from its scan.
+    start = ss.fit_scan(model, scans).T_scan_model
+    moved = {"upper": upper, "lower": lower.with_vertices(lower.vertices + np.array([0.0, 0.0, 60.0]))}
+    fit = ss.fit_scan(model, moved, T_scan_model=start)
+    assert fit.status == "doubtful" and "mm from the scan of it" in fit.reason
+
+
+def test_the_commands_join_the_scans_of_a_subject_by_their_names_or_folders(model, tmp_path, capsys) -> None:
+    subject = make_subjects(1, seed=12)[0]
+    for name, scan in scans_of(subject).items():
+        (tmp_path / "bones" / name).mkdir(parents=True)
+        write_mesh(tmp_path / "bones" / name / "anna.ply", scan)
+    write_mesh(tmp_path / "bones" / "upper" / "ben.ply", scans_of(make_subjects(1, seed=14)[0])["upper"])
+    model.save(tmp_path / "limb.h5")
+    first = [
+        "fit",
+        str(tmp_path / "limb.h5"),
+        str(tmp_path / "bones"),
+        "-o",
+        str(tmp_path / "out"),
+        "--quiet",
+        "--jobs",
+        "1",
+    ]
+    assert main(first) == 0
+    fitted = read_mesh(tmp_path / "out" / "anna.fitted.ply")
+    assert np.linalg.norm(fitted.vertices - subject.vertices, axis=1).mean() < 0.1
+    assert (tmp_path / "out" / "ben_upper.fit.json").is_file() and not (tmp_path / "out" / "ben.fit.json").exists()
+    written = (tmp_path / "out" / "anna.fit.json").stat().st_mtime_ns
+    # The list names each scan with its part; the same results are valid for it.
+    again = [
+        "fit",
+        str(tmp_path / "limb.h5"),
+        str(tmp_path / "out" / "scans.csv"),
+        "-o",
+        str(tmp_path / "out"),
+        "--jobs",
+        "1",
+    ]
+    assert main(again) == 0
+    assert "2 of 2 scans have valid results" in capsys.readouterr().err
+    assert (tmp_path / "out" / "anna.fit.json").stat().st_mtime_ns == written
+    write_mesh(tmp_path / "bones" / "lower" / "anna.ply", scans_of(make_subjects(1, seed=15)[0])["lower"])
+    assert main(first) == 1
+    assert "lower relative to upper" in capsys.readouterr().err
+    pair = [str(tmp_path / "bones" / name / "anna.ply") for name in ("upper", "lower")]
+    assert main(["complete", str(tmp_path / "limb.h5"), *pair, "-o", str(tmp_path / "done"), "--quiet"]) == 2
+    assert "lower relative to upper" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("pose", ["kept", "removed"])
+def test_a_linear_model_completes_a_scan_of_one_part(pose) -> None:
+    linear = ss.build_model(make_subjects(12, seed=0), ss.BuildConfig(parts=COUNTS, gauge="form", relative_pose=pose))
+    subject = make_subjects(1, seed=9)[0]
+    config = ss.CompletionConfig(samples=4, with_doubtful=True)
+    found = ss.complete(linear, {"lower": scans_of(subject)["lower"]}, config)
+    assert np.linalg.norm(found.vertices - subject.vertices, axis=1)[162:].mean() < 0.3
+    assert found.observed[162:].mean() > 0.9 and not found.observed[:162].any()
+    is_noted = any("mean pose, whose spread is unknown" in note for note in found.notes)
+    assert is_noted == (pose == "removed")
+
+
+def touching(gap: float, sizes: tuple[float, float], angle: float) -> np.ndarray:
+    """Return two ellipsoids whose ends are `gap` mm apart, the second rotated about its end."""
+    first, second = BALL.vertices * [10.0 * sizes[0], 10.0, 10.0], BALL.vertices * [10.0 * sizes[1], 8.0, 8.0]
+    turned = (second + np.array([10.0 * sizes[1] + gap, 0.0, 0.0])) @ Rotation.from_rotvec(
+        [0.0, 0.0, angle]
+    ).as_matrix().T
+    return np.concatenate([first, turned + np.array([10.0 * sizes[0], 0.0, 0.0])])
+
+
+def test_without_contact_no_part_lies_inside_another_and_the_depths_before_and_after_are_noted() -> None:
+    rng = np.random.default_rng(0)
+    shapes = [
+        Mesh(touching(rng.uniform(0.2, 3.0), tuple(1 + 0.2 * rng.normal(size=2)), 0.2 * rng.normal()), FACES)
+        for _ in range(20)
+    ]
+    pair = ss.build_model(shapes, ss.BuildConfig(parts=COUNTS, gauge="form"))
+    scan = Mesh(touching(-1.5, (1.1, 1.0), 0.1) + 0.05 * rng.normal(size=(324, 3)), FACES, name="pair")
+    parts = pair.vertices_of_parts
+    usual, apart = (ss.fit_scan(pair, scan, ss.FitConfig(ss.fit.Robust(no_contact=no))) for no in (False, True))
+    assert find_penetrations(usual.surface(), parts)[0].depth_mm > 1.0
+    assert any("lie inside" in note for note in usual.notes)
+    left = max((found.depth_mm for found in find_penetrations(apart.surface(), parts)), default=0.0)
+    assert left < 0.1
+    depths = next(note for note in apart.notes if note.startswith("Parts lay inside each other by up to 1."))
+    assert f"{left:.2f} mm after contact was forbidden" in depths
+    # Parts that do not touch are fitted as before.
+    free = Mesh(touching(1.0, (1.1, 1.0), 0.1), FACES, name="free")
+    both = [ss.fit_scan(pair, free, ss.FitConfig(ss.fit.Robust(no_contact=no))) for no in (False, True)]
+    assert np.array_equal(both[0].surface().vertices, both[1].surface().vertices)
+
+
 def test_what_a_part_does_not_give_is_refused_in_one_sentence(model) -> None:
     subject = make_subjects(1, seed=13)[0]
     scan = Mesh(subject.vertices[:162], BALL.faces, name="bone")
@@ -131,3 +280,5 @@ def test_what_a_part_does_not_give_is_refused_in_one_sentence(model) -> None:
     one = ss.build_model(make_subjects(8, seed=0), ss.BuildConfig(gauge="form"))
     with pytest.raises(InputError, match="no parts"):
         ss.fit_scan(one, subject).scan_parts()
+    with pytest.raises(FitError, match=r"one part.*--no-contact"):
+        ss.fit_scan(one, subject, ss.FitConfig(ss.fit.Robust(no_contact=True)))

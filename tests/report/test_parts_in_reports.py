@@ -9,11 +9,12 @@ from test_scene import unpack
 
 import shapespace as ss
 from shapespace.cli import main
+from shapespace.model.region import articulation_of, relative_pose
 from shapespace.report import figures
 from shapespace.report.blocks import sections
 from shapespace.report.blocks.blocks import Table
 from shapespace.report.inputs.saved_fits import StagedFit
-from shapespace.report.inputs.subject_parts import Parts, articulation_of, relative_pose
+from shapespace.report.inputs.subject_parts import Parts
 from shapespace.report.render import scene
 from shapespace.report.render.palette import PARTS, oklab
 from shapespace.report.render.renderer import Camera, part_layer, render

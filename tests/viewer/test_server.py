@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from viewer_world import Start, model, scan_file, sentence, start, unpacked
 
-from shapespace.batch.fit_work import FitJob, fit_file
+from shapespace.batch.fit_work import FitJob, FitTask, FitWork
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.fit.fit_scan import FitConfig
 from shapespace.io.meshes.mesh_io import read_mesh
@@ -131,7 +131,9 @@ def fits(model: ShapeModel, scan_file: Path, tmp_path: Path) -> Path:
     folder.mkdir()
     (tmp_path / "empty.ply").write_bytes(b"")
     for name, file, stages in (("a", scan_file, True), ("b", scan_file, False), ("c", tmp_path / "empty.ply", True)):
-        fit_file(FitJob(name, file), model, tmp_path / "model.h5", folder, FitConfig(), stages=stages)
+        FitWork.of(model, tmp_path / "model.h5", folder).do(
+            FitTask(FitJob(name, file), FitConfig(), stages, resume=False)
+        )
     (folder / "d.fit.json").write_text("{")
     return folder
 

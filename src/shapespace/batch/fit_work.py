@@ -56,6 +56,7 @@ class FitJob:
         landmarks: path of the landmarks of the scan, or None.
         metadata: metadata of the scan, by the columns of a list of scans; copied to its record.
         address: address of a remote scan for fsspec; empty for a local file.
+        parts: path of the scan of each part, if there are several; `scan` then only names the subject.
     """
 
     name: str
@@ -63,11 +64,25 @@ class FitJob:
     landmarks: Path | None = None
     metadata: Mapping[str, str] = field(default_factory=dict[str, str])
     address: str = ""
+    parts: Mapping[str, Path] = field(default_factory=dict[str, Path])
 
     @property
     def label(self) -> str:
         """Name of the scan in messages: its address or path."""
         return self.address or str(self.scan)
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Paths of all scans."""
+        return tuple(self.parts.values()) or (self.scan,)
+
+    def read(self, file: Path) -> Mesh | dict[str, Mesh]:
+        """Return the scan, whose path is `file`, or the scan of each part.
+
+        Raises:
+            FileError, MeshError: one cannot be read.
+        """
+        return {part: read_mesh(own) for part, own in self.parts.items()} or read_mesh(file)
 
     @contextlib.contextmanager
     def readable(self) -> Generator[Path]:
@@ -92,24 +107,12 @@ class FitJob:
         Raises:
             FileError: it cannot be read.
         """
+        if self.parts:
+            return structs.replace(self.source(folder), hash=" ".join(map(sha256_of_file, self.files)))
         if not self.address:
             return hashed_source(file, folder)
         version = version_of(self.address)
         return structs.replace(self.source(folder), hash=sha256_of_file(file), remote_version=version)
-
-
-def fit_file(
-    job: FitJob,
-    model: ShapeModel,
-    model_file: Path,
-    folder: Path,
-    config: FitConfig,
-    *,
-    stages: bool = False,
-    on_state: Callable[[IcpState], None] | None = None,
-) -> FitRecord:
-    """Fit one scan from its file, write its results into `folder`, and return its record, see `FitWork.do`."""
-    return FitWork.of(model, model_file, folder, on_state).do(FitTask(job, config, stages, resume=False))
 
 
 def publish(result: FitResult, record: FitRecord, name: str, folder: Path, *, stages: bool) -> None:
@@ -203,7 +206,6 @@ class FitWork:
             FileError: the model cannot be read, or the results cannot be written.
         """
         job, model = task.job, _model.get(self.model_hash, self._load)
-        task = replace(task, config=task.config.for_scan(model, job.name))
         if task.resume:
             task, earlier = resumed(task, self.model_hash, self.folder, self.run)
             if earlier is not None:
@@ -213,7 +215,7 @@ class FitWork:
         try:
             with job.readable() as file:
                 scan_source = job.read_source(file, self.folder)
-                scan = read_mesh(file)
+                scan = job.read(file)
             landmarks: Mapping[str, FloatArray] | None = None
             if job.landmarks is not None:
                 marks_source = File(name=job.landmarks.name, hash=sha256_of_file(job.landmarks))
@@ -234,7 +236,7 @@ class FitWork:
         scan = task.job.source(self.folder)
         if not task.job.address:
             with contextlib.suppress(ShapespaceError):
-                scan = hashed_source(task.job.scan, self.folder)
+                scan = task.job.read_source(task.job.scan, self.folder)
         record = failed_record(scan, model, f"{task.job.label}: {reason}.", task.config.as_dict(), task.job.metadata)
         return _write_failed(structs.replace(record, given_up=self.run), task.job, self.folder)
 
@@ -331,7 +333,7 @@ def is_same_scan(recorded: File, job: FitJob, folder: Path) -> bool:
         now = (there.st_size, there.st_mtime_ns, source_of(job.scan, "", folder).path)
         if (recorded.size_bytes, recorded.modified_ns, recorded.path) == now:
             return True
-    return recorded.hash == sha256_of_file(job.scan)
+    return recorded.hash == job.read_source(job.scan, folder).hash
 
 
 _FORBIDDEN = re.compile(r'[<>:"/\\|?*\x00-\x1f]')

@@ -291,7 +291,8 @@ def fit_many(
         sink.open(tuple(unique), config.model, reuse=config.reuse)
         tasks: list[FitTask] = []
         for job in unique.values():
-            task, record = sink.find_valid(FitTask(job, config.fit, config.stages, config.reuse))
+            own = config.fit.for_scan(config.model, job.name)
+            task, record = sink.find_valid(FitTask(job, own, config.stages, config.reuse))
             if record is None:
                 tasks.append(task)
                 continue

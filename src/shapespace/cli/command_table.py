@@ -564,6 +564,7 @@ COMMANDS: tuple[CommandSpec, ...] = (
                      "NAME", "robust: pose and shape jointly, from distances in both directions; paper: the "
                      "paper's modified ICP", FIT),
             *_FIT_OPTIONS,
+            advanced("--no-contact", help="parts of the model, such as bones, must not lie inside each other"),
             _jobs_option("scans"),
             advanced("--again", help="fit all scans again, also those with valid results", either="results"),
             advanced("--store",

@@ -102,6 +102,7 @@ _LABELS: Mapping[str, str] = {
     "level": "Significance level", "licence": "Licence", "maps": "Test each vertex",
     "max-iterations": "Maximum iterations", "method": "Method", "min-seen": "Minimum observed share",
     "mirror": "Mirror images", "missing": "Missing values", "modes": "Number of modes", "nearest": "Nearest subjects",
+    "no-contact": "Parts without penetration",
     "no-align": "Without alignment", "order": "Order of times", "out-of-core": "Stream through a file",
     "outer": "Remove inner surfaces", "pairs": "Mirrored pairs", "part": "Region to estimate",
     "permutations": "Permutations", "pose": "Rotation of the scans", "probe": "Scans to identify",

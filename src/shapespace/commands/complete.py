@@ -11,12 +11,12 @@ import numpy as np
 from shapespace.batch.progress import progress
 from shapespace.cohort.shape_samples import ENDING
 from shapespace.commands.fit import landmark_files, scan_jobs
-from shapespace.commands.inputs import given_scans
+from shapespace.commands.inputs import expand_part_folders, given_scans, join_specimens
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.fit.completion.complete import Completion, CompletionConfig, complete, refine_surface
 from shapespace.io.containers.archives import write_arrays
 from shapespace.io.files import make_folder, remove_file
-from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
+from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.store.corresponding import review_of_provenance
 
@@ -63,9 +63,10 @@ def complete_scans(
         FileError: the model cannot be read, or the results not written.
         InputError: one file of landmarks for more than one scan, or no scans.
     """
-    given = given_scans(scans, folder, recursive=files.recursive, say=say)
-    one, many = landmark_files(files.landmarks, len(given))
     model = ShapeModel.load(model_path)
+    scans = expand_part_folders(scans, model.parts)
+    given = join_specimens(given_scans(scans, folder, recursive=files.recursive, say=say), model.parts)
+    one, many = landmark_files(files.landmarks, len(given))
     if review := review_of_provenance(model.provenance):
         say(f"{model_path}: of its training surfaces, {review}.")
     make_folder(folder)
@@ -80,7 +81,7 @@ def complete_scans(
                 remove_file(path)
             try:
                 with job.readable() as file:
-                    scan = read_mesh(file)
+                    scan = job.read(file)
                 own = replace(config, fit=config.fit.for_scan(model, job.name))
                 completion = complete(model, scan, own, landmarks=job.landmarks)
             except ShapespaceError as error:

@@ -30,9 +30,9 @@ from shapespace.commands.correspond import (
     read_scans,
     with_scans,
 )
-from shapespace.commands.correspond_parts import check_parts, correspond_each_part, expand_part_folders
+from shapespace.commands.correspond_parts import check_parts, correspond_each_part
 from shapespace.commands.finished_correspondence import FinishedFolder
-from shapespace.commands.inputs import TABLE_ENDINGS, LandmarkFiles
+from shapespace.commands.inputs import TABLE_ENDINGS, LandmarkFiles, expand_part_folders
 from shapespace.commands.outcome import Aside, Outcome, first_lines
 from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
 from shapespace.correspondence.groupwise import FinishedCorrespondence, add_scans

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -41,15 +41,6 @@ from shapespace.version import __version__
 
 _LISTED = 5  # names in a message, so that it stays short
 _NAME_ADVICE = "name the scans NAME_PART, put them in a folder per part, or give a list with the column part"
-
-
-def expand_part_folders(scans: Sequence[str | Path], parts: Sequence[str]) -> list[str | Path]:
-    """Return `scans` with each folder that contains folders of the parts replaced by these folders."""
-    expanded: list[str | Path] = []
-    for scan in scans:
-        folders = [Path(scan) / part for part in parts if (Path(scan) / part).is_dir()]
-        expanded += folders or [scan]
-    return expanded
 
 
 def check_parts(files: CorrespondFiles, folder: Path, say: Say) -> None:

@@ -19,7 +19,16 @@ from shapespace.batch.fit_work import FitJob
 from shapespace.batch.progress import progress, telling_of_compiling
 from shapespace.batch.result_folder import RECORD
 from shapespace.batch.run import STORE_FROM, BatchConfig, FolderSink, Plan, StoreSink, fit_many, make_jobs
-from shapespace.commands.inputs import Given, LandmarkFiles, given_scans, is_of_fit, with_ids
+from shapespace.commands.inputs import (
+    PART,
+    Given,
+    LandmarkFiles,
+    expand_part_folders,
+    given_scans,
+    is_of_fit,
+    join_specimens,
+    with_ids,
+)
 from shapespace.commands.outcome import LISTED, Outcome, exit_code_of, first_lines
 from shapespace.errors import InputError, ShapespaceError
 from shapespace.fit.fit_scan import FitConfig
@@ -51,6 +60,7 @@ def fit(
     *,
     method: str,
     search: str,
+    no_contact: bool,
     region: str | None,
     landmarks: Path | None,
     again: bool,
@@ -71,6 +81,7 @@ def fit(
         execution: Executor of the fits.
         method: name of the method.
         search: closest points of the method paper; `auto` for the default of the method.
+        no_contact: whether parts must not lie inside each other.
         region: name of a region of the model, or file of its vertices; None for the complete model.
         landmarks: file of the only scan, or folder with a file for each scan, named as the scans; None without
             landmarks, or if a list of scans names the files.
@@ -88,12 +99,15 @@ def fit(
     """
     config = replace(
         config,
-        method=method_named(method, **({} if search == "auto" else {"search": search})),
+        method=method_named(
+            method, **({} if search == "auto" else {"search": search}), **({"no_contact": True} if no_contact else {})
+        ),
         region=read_region(region) if region is not None and Path(region).is_file() else region,
     )
-    given = _scans_to_fit(scans, output, recursive=recursive, say=say)
-    one, many = landmark_files(landmarks, len(given))
     loaded = ShapeModel.load(model)
+    scans = expand_part_folders(scans, loaded.parts)
+    given = join_specimens(_scans_to_fit(scans, output, recursive=recursive, say=say), loaded.parts)
+    one, many = landmark_files(landmarks, len(given))
     make_folder(output)
     write_bytes(output / ".writable", b"")
     remove_file(output / ".writable")
@@ -193,16 +207,20 @@ def _write_list(folder: Path, jobs: Sequence[FitJob]) -> None:
         FileError: the folder cannot be written, or the disk is full.
     """
     file, is_store = folder / FitRecord.LIST, read_manifest(folder) is not None
-    rows: dict[str, Mapping[str, str]] = {}
+    rows: dict[tuple[str, str], Mapping[str, str]] = {}
     with suppress(ShapespaceError, ValueError, KeyError):  # there is none, or it was changed and is not ours
         header, *earlier = table_rows(read_bytes(file))
         known = [dict(zip(header, row, strict=True)) for row in earlier]
-        rows = {row["id"]: row for row in known if is_store or (folder / f"{row['id']}{RECORD}").is_file()}
+        rows = {
+            (row["id"], row.get(PART, "")): row
+            for row in known
+            if is_store or (folder / f"{row['id']}{RECORD}").is_file()
+        }
     for job in jobs:
-        places = {"scan": job.address or source_of(job.scan, "", folder).path}
-        if job.landmarks is not None:
-            places["landmarks"] = source_of(job.landmarks, "", folder).path
-        rows[job.name] = {**job.metadata, "id": job.name, **places}
+        marks = {} if job.landmarks is None else {"landmarks": source_of(job.landmarks, "", folder).path}
+        for part, scan in (job.parts or {"": job.scan}).items():
+            places = {"scan": job.address or source_of(scan, "", folder).path, **marks}
+            rows[job.name, part] = {**job.metadata, "id": job.name, **({PART: part} if part else {}), **places}
     columns = list(dict.fromkeys(["id", "scan", *(column for row in rows.values() for column in row)]))
     if len(rows) == 1 and len(columns) == 2 and not file.exists():
         return
@@ -259,14 +277,15 @@ def find_suspects(jobs: Sequence[FitJob], *, quiet: bool) -> set[str]:
     total = 0
     for job in here:
         with suppress(OSError):
-            total += job.scan.stat().st_size
+            total += sum(file.stat().st_size for file in job.files)
     suspects: set[str] = set()
     with progress(len(here), "checking", "scan", quiet=quiet) as bar:
         for job in here:
             try:
                 if total > FULL_CHECK_BYTES:
-                    probe_mesh(job.scan)
-                elif not np.isfinite(read_mesh(job.scan).vertices).all(axis=1).any():
+                    for file in job.files:
+                        probe_mesh(file)
+                elif not all(np.isfinite(read_mesh(file).vertices).all(axis=1).any() for file in job.files):
                     suspects.add(job.name)
             except (ShapespaceError, MemoryError):
                 suspects.add(job.name)
@@ -299,7 +318,7 @@ def scan_jobs(given: Sequence[Given], landmarks: Path | None, many: LandmarkFile
     addresses = {scan.path: scan.address for scan in given if scan.address}
     made = with_ids(make_jobs([scan.path for scan in given], landmarks, folder, addresses), given)
     jobs = [
-        replace(job, landmarks=scan.landmarks or job.landmarks or many.of_scan(job.scan))
+        replace(job, landmarks=scan.landmarks or job.landmarks or many.of_scan(job.scan), parts=scan.parts)
         for job, scan in zip(made, given, strict=True)
     ]
     for job in jobs:

@@ -48,12 +48,14 @@ class Given:
         called: name in the column `id` of a list, or empty.
         metadata: the other columns of the list.
         landmarks: landmark file in the column `landmarks` of the list; None if there is none.
+        parts: path of the scan of each part, if there are several; `source` then only names the specimen.
     """
 
     source: Path | str
     called: str = ""
     metadata: dict[str, str] = field(default_factory=dict[str, str])
     landmarks: Path | None = None
+    parts: dict[str, Path] = field(default_factory=dict[str, Path])
 
     @property
     def address(self) -> str:
@@ -259,6 +261,45 @@ def scans_of_parts(scans: Sequence[Given], parts: Sequence[str]) -> dict[str, li
                 there.append(replace(scan, called=specimen))
                 break
     return found
+
+
+def expand_part_folders(scans: Sequence[str | Path], parts: Sequence[str]) -> list[str | Path]:
+    """Return `scans` with each folder that contains folders of the parts replaced by these folders."""
+    expanded: list[str | Path] = []
+    for scan in scans:
+        folders = [Path(scan) / part for part in parts if (Path(scan) / part).is_dir()]
+        expanded += folders or [scan]
+    return expanded
+
+
+def join_specimens(scans: Sequence[Given], parts: Sequence[str]) -> list[Given]:
+    """Return `scans`, with local scans of several parts of a specimen as one, and those of one part named after both.
+
+    Raises:
+        InputError: a specimen has two scans of a part, or two landmark files.
+    """
+    local = {scan.source: scan for scan in scans if parts and not scan.address}
+    specimens: dict[str, dict[str, Given]] = {}
+    for part, found in scans_of_parts(list(local.values()), parts).items():
+        for scan in found:
+            specimens.setdefault(scan.called.casefold(), {})[part] = scan
+    joined = [
+        scan for scan in scans if scan.source not in {s.source for own in specimens.values() for s in own.values()}
+    ]
+    for own in specimens.values():
+        first, marks = next(iter(own.values())), {scan.landmarks for scan in own.values()} - {None}
+        if len(marks) > 1:
+            raise InputError(f"{first.called}: its parts have several files of landmarks; give one with all landmarks.")
+        if len(own) > 1:
+            first = replace(
+                first, source=first.path.with_name(first.called), landmarks=next(iter(marks), None),
+                metadata={name: value for name, value in first.metadata.items() if name.casefold() != PART},
+                parts={part: scan.path for part, scan in own.items()},
+            )  # fmt: skip
+        elif not first.called.casefold().endswith(next(iter(own)).casefold()):
+            first = replace(first, called=f"{first.called}_{next(iter(own))}")
+        joined.append(first)
+    return joined
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,8 @@ from shapespace.io.files import make_folder, remove_file
 from shapespace.io.meshes.mesh_io import mesh_files, read_mesh, write_mesh
 from shapespace.model.additive import load_model
 from shapespace.model.foreign import looks_like_model
+from shapespace.model.region import relative_pose
 from shapespace.model.shape_model import ShapeModel
-from shapespace.report.inputs.subject_parts import relative_pose
 from shapespace.schemas import CORRESPOND_AGAIN, CorrespondenceRecord, CorrespondRecord, read, to_json
 from shapespace.store.corresponding import json_of
 from shapespace.store.results import Results, mesh_at, modes_of, results_at

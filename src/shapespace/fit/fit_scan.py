@@ -6,7 +6,8 @@ import hashlib
 import os
 import re
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
@@ -16,6 +17,7 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from shapespace.errors import FitError, InputError
+from shapespace.fit.diagnostics.reasons import Reason
 from shapespace.fit.diagnostics.verdict import judge
 from shapespace.fit.iteration_state import UNSEEN, Fitted, IcpState
 from shapespace.fit.method import FitOutcome, Limits, Method
@@ -36,13 +38,13 @@ from shapespace.geometry.contact import find_penetrations
 from shapespace.geometry.doctor import repair
 from shapespace.geometry.grooming import Crop
 from shapespace.geometry.landmark_placement import landmarks_in_frame_of
-from shapespace.geometry.normals import rms_size
+from shapespace.geometry.normals import part_of, rms_size
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.interop import MeshLike, as_mesh
 from shapespace.io.landmarks.landmark_io import read_landmarks
-from shapespace.model.region import ModelRegion
+from shapespace.model.region import ModelRegion, articulation_of, relative_pose
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import MM_PER_UNIT, BoolArray, FloatArray, IntArray, Mesh, Similarity, SurfaceLandmarks
+from shapespace.types import MM_PER_UNIT, BoolArray, FloatArray, IntArray, Mesh, Similarity
 from shapespace.version import __version__
 
 if TYPE_CHECKING:
@@ -61,15 +63,6 @@ class RegionFit:
     full: ShapeModel
     part: ModelRegion
 
-    @staticmethod
-    def of(full: ShapeModel, region: str | tuple[int, ...]) -> RegionFit:
-        """Return the region fit of a model.
-
-        Raises:
-            InputError: there is no such region, or no triangle lies in it.
-        """
-        return RegionFit(full, ModelRegion.of(full, region))
-
     def note(self, region: str | tuple[int, ...] | None) -> str:
         """Return a sentence on the region that the fit is restricted to."""
         called = f" {region!r}" if isinstance(region, str) else ""
@@ -82,14 +75,6 @@ class RegionFit:
     def state(self, state: IcpState) -> IcpState:
         """Return a state with the coefficients of the complete model."""
         return replace(state, b=self.part.to_b(state.b, self.full))
-
-    def forward_states(self, on_state: Callable[[IcpState], None]) -> Callable[[IcpState], None]:
-        """Return a function that calls `on_state` with the states of the complete model."""
-        return lambda state: on_state(self.state(state))
-
-    def landmarks(self, model: ShapeModel) -> SurfaceLandmarks:
-        """Return the landmarks of `model` that lie in the region."""
-        return model.landmarks.within(self.part.inside)
 
     def fitted(self, fitted: Fitted, modes: int | None) -> Fitted:
         """Return the end of the fit for the complete model, with its first `modes` coefficients; None for all."""
@@ -134,11 +119,13 @@ class RegionFit:
 _FAR_OUT = 3.0  # standard deviations; a normal coefficient exceeds them once in 370
 _FAR_OUT_BY_CHANCE = 0.01  # share of coefficients beyond it up to which there is no note; chance alone gives 0.3 %
 _ALL_BUT_THE_RIM = 0.95  # share of vertices; a complete scan still lacks vertices at its border
+_NO_TRIANGLES = "It has no triangles, so distances are to its points and larger than to the surface that they sample."
+_FAR_AWAY = 5.0  # standard deviations of the residuals; the median of normal ones is 0.7
+_OTHER_FRAME = 6.0
+"""Standard deviations of a relative pose in the model, beyond which parts are not in one frame: normal values exceed it
+once in 500 million, and frames that differ by chance do so by far more."""
 _VANISHED = 0.05
 """Share of the start's scale below which the model counts as shrunk to a point."""
-
-OPTIONS = ("landmark_stddev_mm", "crop", "region", "strict")
-"""Settings that a record contains only if they are set."""
 
 OnState: TypeAlias = Callable[[IcpState], None]
 PathTo: TypeAlias = str | os.PathLike[str]
@@ -235,16 +222,17 @@ class FitConfig:
         # Not `asdict` of all fields: a method given by name has settings too.
         common = {name: getattr(self, name) for name in ("modes", "unit", "scale", "max_iterations", "seed", "dense")}
         method = self.fitting
+        stddev = self.landmark_stddev_mm
+        optional = {
+            "landmark_stddev_mm": "inf" if stddev == np.inf else stddev,  # JSON has no infinity
+            "crop": self.crop,
+            "region": self.region
+            if self.region is None or isinstance(self.region, str)
+            else _region_settings(self.region),
+            "strict": self.strict,
+        }
         # Options that are not set are not written, so that such records equal those of versions without the options.
-        if self.landmark_stddev_mm is not None:
-            # JSON has no infinity.
-            common["landmark_stddev_mm"] = self.landmark_stddev_mm if np.isfinite(self.landmark_stddev_mm) else "inf"
-        if self.crop:
-            common["crop"] = self.crop
-        if self.region is not None:
-            common["region"] = self.region if isinstance(self.region, str) else _region_settings(self.region)
-        if self.strict:
-            common["strict"] = True
+        common |= {name: value for name, value in optional.items() if value}
         return {
             "method": method.name, **common, "dense_settings": asdict(self.dense_settings),
             method.name: asdict(method),  # type: ignore[call-overload]
@@ -253,7 +241,7 @@ class FitConfig:
 
 def fit_scan(
     model: ShapeModel | AdditiveModel | PathTo,
-    scan: MeshLike,
+    scan: MeshLike | Mapping[str, MeshLike],
     config: FitConfig | None = None,
     *,
     landmarks: Mapping[str, FloatArray] | PathTo | None = None,
@@ -264,7 +252,9 @@ def fit_scan(
 
     Args:
         model: the shape model, or the path of its file.
-        scan: a mesh or point cloud, in its own frame and unit; its path; or any other input of `as_mesh`.
+        scan: a mesh or point cloud, in its own frame and unit; its path; or any other input of `as_mesh`. For a model
+            of several parts also name of a part -> its scan, all in one frame and unit: points of a scan belong to its
+            part only. The scan of one part is fitted by this part alone.
         config: settings; None for the defaults.
         landmarks: name -> (3,) in the scan's frame and unit, or the path of their file; they initialise the fit and, in
             the robust method, constrain it (`FitConfig.landmark_stddev_mm`); None to use none.
@@ -282,44 +272,42 @@ def fit_scan(
     files = {
         name: Path(cast(PathTo, path)).absolute() for name, path in given.items() if isinstance(path, str | os.PathLike)
     }
-    model, scan = _as_model(model), as_mesh(scan)
+    model = _as_model(model)
+    parts = cast("Mapping[str, MeshLike]", scan) if isinstance(scan, Mapping) else dict[str, MeshLike]()
+    if len(parts) == 1:
+        [(part, scan)] = parts.items()
+        config = config.for_scan(model, f"_{part}")
+    elif parts:
+        if config.region is not None or not config.fitting.calibrated:
+            raise InputError("Scans of several parts need the robust method and no region; omit these options.")
+        scan = join_scans(model, parts, strict=config.strict)
+    scan = as_mesh(cast("MeshLike", scan))
     if "landmarks" in files:
         landmarks = read_landmarks(files["landmarks"])
     landmarks = cast("Mapping[str, FloatArray] | None", landmarks)
     # Such small products are slower with several threads, and parallel fits share the cores anyway.
     with _thread_controller().limit(limits=1, user_api="blas"):
         clock = [time.perf_counter()]
-        held = None if config.region is None else RegionFit.of(model, config.region)
+        held = None if config.region is None else RegionFit(model, ModelRegion.of(model, config.region))
         own = model if held is None else held.part.model
         placed = _place_scan(model, own, scan, config, landmarks, T_scan_model)
         clock.append(time.perf_counter())
         limits = config.limits(model)
         if held is not None:
-            limits, on_state = (
-                replace(limits, modes=None, part=True),
-                None if on_state is None else held.forward_states(on_state),
-            )
-        recorder = _Recorder(placed, on_state)
-        states = config.fitting.states(own, placed.target, placed.start, limits)
-        try:
-            while True:
-                recorder.add(next(states))
-        except StopIteration as end:
-            driven = recorder.driven(end.value)
-        except InputError as error:
-            advice = "give landmarks (--landmarks), or crop the scan (--crop)"
-            raise FitError(f"{placed.scan.name}: the fit diverged ({error}); {advice}.") from error
+            limits = replace(limits, modes=None, part=True)
+        driven = _run_method(config.fitting.states(own, placed.target, placed.start, limits), placed, held, on_state)
         clock.append(time.perf_counter())
         stages = _measure_stages(own, placed, driven, config)
         clock.append(time.perf_counter())
         size_mm = rms_size(own.mean_vertices) * driven.fitted.T_scan_fitted.scale
         ended = FitOutcome(own, placed.start, driven.fitted, stages, driven.ended, size_mm)
         status, reasons = judge(config.fitting, ended)
+        if far := _parts_far_away(model, placed.scan, driven.fitted, stages["final"]):
+            status, reasons = "doubtful", (*far, *(reasons if status == "doubtful" else ()))
         if held is not None:
             driven = replace(
                 driven,
                 history=[held.state(state) for state in driven.history],
-                ended={phase: held.state(state) for phase, state in driven.ended.items()},
                 fitted=held.fitted(driven.fitted, config.modes),
             )
             stages = _measure_stages(model, placed, driven, config, held.part.inside)
@@ -351,7 +339,7 @@ def fit_scan(
             *placed.findings,
             *([] if held is None else [held.note(config.region)]),
             *_note_large_coefficients(model, fitted.b),
-            *_note_no_triangles(placed.scan),
+            *([_NO_TRIANGLES] if placed.scan.faces is None else []),
             *_note_unobserved(stages),
             *_note_penetrations(model, fitted),
             *fitted.notes,
@@ -405,44 +393,45 @@ class _PlacedScan:
 
 @dataclass(frozen=True, eq=False)
 class _MethodRun:
-    """The run of a method: every state, the last state of each phase, the end."""
+    """The run of a method: every state, the time when phase 2 began, the end."""
 
     history: Sequence[IcpState]
-    ended: Mapping[int, IcpState]
     phase_2_from: float
     fitted: Fitted
 
+    @property
+    def ended(self) -> dict[int, IcpState]:
+        """Last state of each phase."""
+        return {state.phase: state for state in self.history}
 
-class _Recorder:
-    """Collects the states of a method."""
 
-    def __init__(self, placed: _PlacedScan, on_state: OnState | None) -> None:
-        self._placed, self._on_state = placed, on_state
-        self._history: list[IcpState] = []
-        self._ended: dict[int, IcpState] = {}
-        self._phase_2_from = time.perf_counter()
+def _run_method(
+    states: Generator[IcpState, None, Fitted], placed: _PlacedScan, held: RegionFit | None, on_state: OnState | None
+) -> _MethodRun:
+    """Return the states and the end of a method.
 
-    def add(self, state: IcpState) -> None:
-        """Append a state.
-
-        Raises:
-            FitError: the model has shrunk to a point.
-        """
-        if state.phase == 2 and 2 not in self._ended:
-            self._phase_2_from = time.perf_counter()
-        self._history.append(state)
-        self._ended[state.phase] = state
-        if self._on_state is not None:
-            self._on_state(state)
-        if state.T_scan_model.scale < _VANISHED * self._placed.start.T_scan_model.scale:
-            raise FitError(
-                f"{self._placed.scan.name}: the model shrank to a point, as the plain method does when a large part of "
-                "the scan is missing; fix the scale (--scale fixed), or fit only the part that it shows (--region)."
-            )
-
-    def driven(self, fitted: Fitted) -> _MethodRun:
-        """Return the run of the method, from its recorded states and its end `fitted`."""
-        return _MethodRun(self._history, self._ended, self._phase_2_from, fitted)
+    Raises:
+        FitError: the model has shrunk to a point, or the fit diverged.
+    """
+    history, phase_2_from, name = list[IcpState](), time.perf_counter(), placed.scan.name
+    try:
+        while True:
+            state = next(states)
+            if state.phase == 2 and (not history or history[-1].phase == 1):
+                phase_2_from = time.perf_counter()
+            history.append(state)
+            if on_state is not None:
+                on_state(state if held is None else held.state(state))
+            if state.T_scan_model.scale < _VANISHED * placed.start.T_scan_model.scale:
+                raise FitError(
+                    f"{name}: the model shrank to a point, as the plain method does when a large part of the scan is "
+                    "missing; fix the scale (--scale fixed), or fit only the part that it shows (--region)."
+                )
+    except StopIteration as end:
+        return _MethodRun(history, phase_2_from, end.value)
+    except InputError as error:
+        advice = "give landmarks (--landmarks), or crop the scan (--crop)"
+        raise FitError(f"{name}: the fit diverged ({error}); {advice}.") from error
 
 
 def _place_scan(
@@ -459,8 +448,9 @@ def _place_scan(
     if config.crop:
         scan, cropped = crop_scan(Crop.of(config.crop), scan, full_model, landmarks, config.unit)
         notes.append(cropped)
-    scan, findings = repair(scan, strict=config.strict)
-    mm = MM_PER_UNIT[find_unit(model, scan) if config.unit == "auto" else config.unit]
+    scan, findings = repair(scan, strict=config.strict) if scan.parts is None else (scan, ())
+    find = find_unit if scan.parts is None else _unit_of_parts
+    mm = MM_PER_UNIT[find(model, scan) if config.unit == "auto" else config.unit]
     T_mm_scan = mm_frame(scan, mm)
     scan_mm = scan.with_vertices(T_mm_scan.apply(scan.vertices))
     with_scale = config.limits(model).with_scale
@@ -469,6 +459,14 @@ def _place_scan(
         start = Start(T_mm_scan @ T_scan_model, "given", float("nan"))
     elif landmarks:
         start = start_from_landmarks(full_model, marks_mm, scan.name, with_scale=with_scale)
+    elif scan.parts is not None:
+        part_config = replace(config, unit="mm", crop="", dense=False, modes=None)
+        start = _start_from_parts(
+            model,
+            scan_mm,
+            lambda own, part: fit_scan(model, own, replace(part_config, region=part)),
+            with_scale=with_scale,
+        )
     elif with_scale:
         start = start_of_any_size(model, scan_mm.vertices, seed=config.seed)
     else:
@@ -477,7 +475,142 @@ def _place_scan(
         stddev_mm = config.landmark_stddev_mm or SHARE * rms_size(full_model.mean_vertices) * start.T_scan_model.scale
         start = replace(start, marks=LandmarkConstraint.of(model, marks_mm, stddev_mm))
     notes += [*scan.notes, *(f"{finding.problem} {finding.action}".strip() for finding in findings)]
-    return _PlacedScan(scan, mm, T_mm_scan.inverse(), ScanTarget(scan_mm), start, notes)
+    target = ScanTarget(scan_mm, None if scan.parts is None else model.part_of_vertex)
+    return _PlacedScan(scan, mm, T_mm_scan.inverse(), target, start, notes)
+
+
+def join_scans(model: ShapeModel, scans: Mapping[str, MeshLike], *, strict: bool) -> Mesh:
+    """Return scans of parts of one subject, by the names of the parts, as one repaired scan with `Mesh.parts`.
+
+    Args:
+        model: shape model with these parts.
+        scans: scan of each part, in one frame and unit.
+        strict: see `repair`.
+
+    Raises:
+        InputError: other parts than those of the model, or the same scan twice.
+        MeshError: a scan cannot be used.
+    """
+    if not scans or not set(scans) <= set(model.parts):
+        raise InputError(
+            f"The scans are of {', '.join(scans) or 'no part'}, and the model has the parts "
+            f"{', '.join(model.parts) or '(none)'}; give scans of its parts."
+        )
+    meshes, notes = list[Mesh](), list[str]()
+    for part, scan in scans.items():
+        mesh, findings = repair(as_mesh(scan), strict=strict)
+        for other, own in zip(scans, meshes, strict=False):
+            if np.array_equal(own.vertices, mesh.vertices):
+                raise InputError(f"{mesh.name}: {other} and {part} are the same scan; give the scan of each part.")
+        notes += [f"{part}: {note}" for note in (*mesh.notes, *(f"{f.problem} {f.action}".strip() for f in findings))]
+        meshes.append(mesh)
+    counts = [len(mesh.vertices) for mesh in meshes]
+    starts = np.cumsum([0, *counts])
+    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False) if mesh.faces is not None]
+    colours = [mesh.colours for mesh in meshes if mesh.colours is not None]
+    return Mesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate(faces) if len(faces) == len(meshes) else None,
+        {name: point for mesh in meshes for name, point in mesh.landmarks.items()},
+        meshes[0].name.removesuffix(next(iter(scans))).rstrip("_-. ") or meshes[0].name,
+        np.concatenate(colours) if len(colours) == len(meshes) else None,
+        tuple(notes),
+        parts=np.repeat([model.parts.index(part) for part in scans], counts).astype(np.int32),
+    )
+
+
+def _scan_of_each_part(model: ShapeModel, scan: Mesh) -> dict[str, Mesh]:
+    """Return the scan of each part that a scan with known parts has, by the name of the part."""
+    found = {part: scan.parts == k for k, part in enumerate(model.parts)}
+    return {
+        part: replace(part_of(scan, own), parts=None, name=f"{scan.name} {part}")
+        for part, own in found.items()
+        if own.any()
+    }  # fmt: skip
+
+
+def _unit_of_parts(model: ShapeModel, scan: Mesh) -> str:
+    """Return the unit of a scan with known parts: that of the part of which it shows most, by its size.
+
+    Raises:
+        FitError: that part has the size of its part of the model in no unit.
+    """
+    sizes = {
+        part: rms_size(own.vertices) / rms_size(model.mean_vertices[model.regions[part]])
+        for part, own in _scan_of_each_part(model, scan).items()
+    }
+    largest = max(sizes, key=lambda part: sizes[part])
+    return find_unit(ModelRegion.of(model, largest).model, _scan_of_each_part(model, scan)[largest])
+
+
+def _start_from_parts(
+    model: ShapeModel, scan_mm: Mesh, fit: Callable[[Mesh, str], FitResult], *, with_scale: bool
+) -> Start:
+    """Return the pose and shape that are nearest to the fits of the parts of a scan, each alone.
+
+    Args:
+        model: shape model of several parts.
+        scan_mm: scan with known parts in its mm frame.
+        fit: function that fits a scan by a part of the model.
+        with_scale: whether the scale is free.
+
+    Raises:
+        FitError: two parts are exchanged or have different units, or a relative pose is unlike those of the model.
+        InputError: the relative pose was removed from the model.
+    """
+    pose = relative_pose(model)
+    if pose is None or pose.choice == "removed":
+        raise InputError(
+            "The relative pose was removed from the model, so parts have no joint fit; fit each part alone, or build "
+            "the model with --relative-pose modelled."
+        )
+    scans = _scan_of_each_part(model, scan_mm)
+    fits = {part: fit(own, part) for part, own in scans.items()}
+
+    def is_fit(scan: Mesh, part: str) -> bool:
+        with suppress(FitError):
+            return fit(scan, part).status != "doubtful"
+        return False
+
+    doubtful = [part for part, found in fits.items() if found.status == "doubtful"]
+    for part in doubtful:
+        for other in set(fits) - {part}:
+            if is_fit(scans[part], other) and is_fit(scans[other], part):
+                raise FitError(f"{scan_mm.name}: {part} and {other} are exchanged; rename their scans.")
+        mm = MM_PER_UNIT[find_unit(ModelRegion.of(model, part).model, scans[part])]
+        if mm != 1.0 and is_fit(scans[part].with_vertices(mm * scans[part].vertices), part):
+            raise FitError(f"{scan_mm.name}: {part} has another unit than the other parts; export them in one unit.")
+    # A small piece of a part has no certain pose alone.
+    sure = [part for part in fits if part not in doubtful] or list(fits)
+    vertices = np.full(model.mean_vertices.shape, np.nan)
+    for part in sure:
+        vertices[model.regions[part]] = fits[part].surface().vertices[model.regions[part]]
+    scale = fits[sure[0]].T_scan_model.scale
+    poses = articulation_of(model).poses_of(np.where(np.isnan(vertices), model.mean_vertices, vertices / scale))
+    for joint, rotation, translation in zip(pose.joints, poses.rotation, poses.translation, strict=True):
+        turn_deg, shift_mm = float(np.rad2deg(np.linalg.norm(rotation))), float(np.linalg.norm(translation))
+        off = max(turn_deg / joint.rotation_deg, shift_mm / joint.translation_mm)
+        if {joint.part, joint.parent} <= set(sure) and off > _OTHER_FRAME:
+            raise FitError(
+                f"{scan_mm.name}: {joint.part} relative to {joint.parent} is rotated by {turn_deg:.0f} degrees and "
+                f"moved by {shift_mm:.0f} mm from the mean, {off:.0f} standard deviations; give scans of one subject "
+                "in one frame, or fit each part alone."
+            )
+    error_mm = max(fits[part].evidence.expected_error_mm for part in sure) / scale
+    b, T = model.nearest_in_any_pose(vertices, with_scale=with_scale, noise=error_mm**2 / 3.0)
+    return Start(T, "parts", float("nan"), b)
+
+
+def _parts_far_away(model: ShapeModel, scan: Mesh, fitted: Fitted, final: Stage) -> list[Reason]:
+    """Return a reason for doubt for each part of a scan with known parts that its fitted surface does not follow."""
+    if scan.parts is None or fitted.evidence is None:
+        return []
+    distance_mm, limit_mm = final.distances.scan_to_model_mm, _FAR_AWAY * fitted.evidence.spread_mm
+    return [
+        Reason.other(f"the fitted {part} is {median_mm:.1f} mm from the scan of it (median)")
+        for k, part in enumerate(model.parts)
+        if (own := scan.parts == k).any() and (median_mm := float(np.median(distance_mm[own]))) > limit_mm
+    ]
 
 
 def _measure_stages(
@@ -511,7 +644,7 @@ def _landmark_stddev_mm(
     if fitted.landmark_covariance is None:
         return None
     variance = np.einsum("lii->li", fitted.landmark_covariance).copy()
-    landmarks = model.landmarks if held is None else held.landmarks(model)
+    landmarks = model.landmarks if held is None else model.landmarks.within(held.part.inside)
     if not dense:
         # The surface was projected onto the model's modes, and the projection moves a landmark away from its position.
         in_modes = fitted.T_scan_model.apply(landmarks.interpolate(model.reconstruct(fitted.b)))
@@ -524,7 +657,7 @@ def _note_penetrations(model: ShapeModel, fitted: Fitted) -> list[str]:
     if not model.parts or model.faces is None or fitted.evidence is None:
         return []
     surface = Mesh(fitted.vertices_scan_mm, model.faces)
-    found = find_penetrations(surface, {part: model.regions[part] for part in model.parts})
+    found = find_penetrations(surface, model.vertices_of_parts)
     return [
         f"{100 * penetration.share:.1f} % of the vertices of {penetration.part} lie inside {penetration.other}, by up "
         f"to {penetration.depth_mm:.1f} mm; the parts of a subject do not."
@@ -554,12 +687,6 @@ def _note_unobserved(stages: Mapping[str, Stage]) -> list[str]:
         f"The dense surface follows the scan at {100 * dense.seen.mean():.0f} % of its vertices; at the others the "
         "scan shows nothing, and the surface follows the model."
     ]
-
-
-def _note_no_triangles(scan: Mesh) -> list[str]:
-    if scan.faces is not None:
-        return []
-    return ["It has no triangles, so distances are to its points and larger than to the surface that they sample."]
 
 
 def _note_large_coefficients(model: ShapeModel, b: FloatArray) -> list[str]:
@@ -592,7 +719,7 @@ def _dense_stage(
 
 
 def _closest(target: ScanTarget, T_mm_scan: Similarity, points: FloatArray) -> ClosestPoints:
-    return target.engine.query(T_mm_scan.apply(points))
+    return target.engine.query(T_mm_scan.apply(points) + target.vertex_shift(slice(None)))
 
 
 def _measure_distances(
@@ -604,5 +731,6 @@ def _measure_distances(
     Distances are in mm of the scan. If `region` (V,) is given, only its vertices count.
     """
     vertices = T.apply(model.reconstruct(b)) if vertices_scan_mm is None else vertices_scan_mm
-    placed = Mesh(vertices, model.faces, name="model")
-    return surface_distances(placed, target.mesh, scan_engine=target.engine, region=region)
+    placed = Mesh(vertices + target.vertex_shift(slice(None)), model.faces, name="model")
+    region = target.shown if region is None else region
+    return surface_distances(placed, target.searched, scan_engine=target.engine, region=region)

@@ -269,14 +269,15 @@ class FitResult:
     def scan_parts(self) -> IntArray:
         """Return the part (S,) of the model that each vertex of the scan belongs to, as an index of `model.parts`.
 
-        It is the part whose fitted surface is nearest.
+        It is the given part, or if parts were not given, that whose fitted surface is nearest.
 
         Raises:
             InputError: the model has no parts.
         """
-        if not self.model.parts:
+        if (part := self.model.part_of_vertex) is None:
             raise InputError("The model has no parts; build it from specimens of several parts.")
-        part = np.repeat(np.arange(len(self.model.parts)), list(self.model.part_counts.values()))
+        if self.scan.parts is not None:
+            return self.scan.parts
         return part[build_engine(self.surface()).query(self.scan.vertices).vertex].astype(np.int32)
 
     def save(self, folder: str | PathLike[str], name: str = "", *, stages: bool = False) -> Path:

@@ -15,6 +15,7 @@ from shapespace.geometry.normals import boundary_vertices, rms_size
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import MM_PER_UNIT, BoolArray, FloatArray, IntArray, Mesh, Similarity
 
+_APART = 10.0  # extents of a scan, by which its parts are moved apart: no other part is nearer
 _ROUNDS = 4
 """Rounds in which the share of the larger areas is adjusted for vertices that are drawn for certain."""
 
@@ -29,21 +30,50 @@ def mm_frame(scan: Mesh, mm_per_scan_unit: float) -> Similarity:
 class ScanTarget:
     """A scan in its mm frame; derived data are computed once, on first access.
 
+    The parts of a scan with known parts are moved apart by `shift` for all searches, so that
+    they match the vertices of their own part only.
+
     Args:
         mesh: the scan.
+        part_of_vertex: (V,) part of each vertex of the model, to which `mesh.parts` refers; None if parts are unknown.
     """
 
     mesh: Mesh
+    part_of_vertex: IntArray | None = None
+
+    @cached_property
+    def shown(self) -> BoolArray | None:
+        """(V,) False for vertices of the model in parts that the scan lacks; None if its parts are unknown."""
+        if self.part_of_vertex is None or self.mesh.parts is None:
+            return None
+        return np.isin(self.part_of_vertex, self.mesh.parts)
+
+    def shift(self, parts: IntArray | None) -> FloatArray | float:
+        """Return the shifts (M, 3) mm by which points of `parts` (M,) are searched, or 0 if parts are unknown."""
+        if parts is None or self.part_of_vertex is None:
+            return 0.0
+        far = _APART * float(np.ptp(self.mesh.vertices))
+        return parts[:, None].astype(np.float64) * [far, 0.0, 0.0]
+
+    def vertex_shift(self, vertex: IntArray | slice) -> FloatArray | float:
+        """Return `shift` of the vertices `vertex` (M,) of the model."""
+        return self.shift(None if self.part_of_vertex is None else self.part_of_vertex[vertex])
+
+    @cached_property
+    def searched(self) -> Mesh:
+        """The scan with its parts moved apart."""
+        shift = self.shift(self.mesh.parts)
+        return self.mesh if isinstance(shift, float) else self.mesh.with_vertices(self.mesh.vertices + shift)
 
     @cached_property
     def engine(self) -> ClosestPointEngine:
         """Search structure of the surface, or of the points if the scan has no triangles."""
-        return build_engine(self.mesh)
+        return build_engine(self.searched)
 
     @cached_property
     def vertex_engine(self) -> VertexEngine:
         """Search structure of the vertices."""
-        return VertexEngine(self.mesh)
+        return VertexEngine(self.searched)
 
     def search(self, name: str) -> ClosestPointEngine:
         """Return the engine called `name` in `ENGINES`."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import permutations
 
 import numpy as np
 
-from shapespace.geometry.closest import build_engine
+from shapespace.geometry.closest import ClosestPoints, build_engine
 from shapespace.geometry.normals import boundary_edges
 from shapespace.types import IntArray, Mesh
 
@@ -32,8 +32,14 @@ class Penetration:
     depth_mm: float
 
 
-def find_penetrations(surface: Mesh, parts: Mapping[str, IntArray]) -> list[Penetration]:
-    """Return the penetrations of the parts of a surface, the deepest first; open parts contain nothing.
+def find_overlaps(
+    surface: Mesh, parts: Mapping[str, IntArray]
+) -> Iterator[tuple[str, str, IntArray, IntArray, ClosestPoints]]:
+    """Yield the vertices of each part that lie inside another, closed part.
+
+    Yields:
+        Name of the part, name of the other part, vertices (M,) inside it, the corners (M, 3) of the triangles of their
+        closest points on its surface, and these points.
 
     Args:
         surface: surface with triangles.
@@ -41,7 +47,6 @@ def find_penetrations(surface: Mesh, parts: Mapping[str, IntArray]) -> list[Pene
     """
     import igl  # slow to import
 
-    found = list[Penetration]()
     faces = np.asarray(surface.faces)
     for part, other in permutations(parts, 2):
         own = faces[np.isin(faces, parts[other]).all(axis=1)]
@@ -50,8 +55,16 @@ def find_penetrations(surface: Mesh, parts: Mapping[str, IntArray]) -> list[Pene
         if not near.any() or len(boundary_edges(own)):
             continue
         winding = np.asarray(igl.fast_winding_number(surface.vertices, own.astype(np.int64), points[near]))
-        inside = points[near][winding > _INSIDE]
-        if len(inside):
-            depth = float(build_engine(Mesh(surface.vertices, own)).query(inside).distance.max())
-            found.append(Penetration(part, other, len(inside) / len(points), depth))
+        vertex = parts[part][near][winding > _INSIDE]
+        if len(vertex):
+            closest = build_engine(Mesh(surface.vertices, own)).query(surface.vertices[vertex])
+            yield part, other, vertex, own[closest.triangle], closest
+
+
+def find_penetrations(surface: Mesh, parts: Mapping[str, IntArray]) -> list[Penetration]:
+    """Return the penetrations of the parts of a surface, the deepest first; see `find_overlaps`."""
+    found = [
+        Penetration(part, other, len(vertex) / len(parts[part]), float(near.distance.max()))
+        for part, other, vertex, _, near in find_overlaps(surface, parts)
+    ]
     return sorted(found, key=lambda penetration: -penetration.depth_mm)

@@ -42,7 +42,10 @@ def part_of(mesh: Mesh, keep: BoolArray) -> Mesh:
     colours = None if mesh.colours is None else mesh.colours[keep]
     observed = None if mesh.observed is None else mesh.observed[keep]
     std = None if mesh.position_std is None else mesh.position_std[keep]
-    return replace(mesh, vertices=vertices, faces=faces, colours=colours, observed=observed, position_std=std)
+    parts = None if mesh.parts is None else mesh.parts[keep]
+    return replace(
+        mesh, vertices=vertices, faces=faces, colours=colours, observed=observed, position_std=std, parts=parts
+    )
 
 
 def with_triangles(mesh: Mesh, keep: BoolArray, cause: str) -> Mesh:

@@ -1,4 +1,4 @@
-"""A model of a part of its surface, for fits that are restricted to a region.
+"""A model of a part of its surface, for fits that are restricted to a region, and the relative poses of parts.
 
 The region's vertices vary as in the complete model: the modes of the part are the principal components of the
 model's own modes there, and each coefficient vector of the part corresponds to one of the model. So the surface beyond
@@ -7,14 +7,17 @@ the region does not affect the fit, whose result is given in the coefficients of
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from shapespace.errors import InputError
-from shapespace.geometry.articulation import Articulation
+from shapespace.geometry.articulation import Articulation, PartPoses
 from shapespace.geometry.normals import without_vertices
 from shapespace.io.memory_cache import cached_with_owner
+from shapespace.model.representation import Articulated
 from shapespace.model.shape_model import ShapeModel, region_vertices
 from shapespace.types import BoolArray, FloatArray
 
@@ -180,3 +183,65 @@ def _build_part(full: ShapeModel, region: str | tuple[int, ...]) -> ModelRegion:
         b = full.training.coefficients[:, : full.n_modes]
         prediction = RegionPrediction.of((b / full.stddev) @ lift * model.stddev, b)
     return ModelRegion(model, inside, lift, prediction)
+
+
+_STILL = 1e-6  # share of the SD of the first mode; smaller rotations, as movements of vertices, are rounding
+
+
+@dataclass(frozen=True)
+class JointSpread:
+    """Standard deviations of the pose of a part relative to its parent, of the modes of a model.
+
+    Args:
+        part: name of the part.
+        parent: name of its parent.
+        rotation_deg: square root of the sum of the variances of the three components of its rotation vector, degrees.
+        translation_mm: the same of its translation at the joint, mm.
+    """
+
+    part: str
+    parent: str
+    rotation_deg: float
+    translation_mm: float
+
+
+@dataclass(frozen=True)
+class RelativePose:
+    """Relative pose of the parts of a model.
+
+    Args:
+        choice: `modelled`: with exact rotations; `kept`: linearly, with the vertices; `removed`: no mode turns a part.
+        joints: spread at each joint; of linear models to first order; empty if the relative pose is removed.
+    """
+
+    choice: Literal["modelled", "kept", "removed"]
+    joints: tuple[JointSpread, ...]
+
+
+def articulation_of(model: ShapeModel) -> Articulation:
+    """Return the joints of a model of several parts: its own, or else those of its mean shape."""
+    if not model.is_linear:
+        return Articulated.from_arrays(model.coding).parts
+    return Articulation(model.mean_vertices, list(model.part_counts.values()))
+
+
+def relative_pose(model: ShapeModel) -> RelativePose | None:
+    """Return the relative pose of the parts of a model, exactly from its modes; None if it has one structure."""
+    if not model.parts:
+        return None
+    articulation = articulation_of(model)
+    moves = (model.vertex_basis * model.stddev).T.reshape(model.n_modes, -1, 3)
+    poses = [articulation.from_tangent(articulation.template + move) for move in moves]  # linear in the displacement
+    rotation, translation = (_spread(poses, field) for field in ("rotation", "translation"))
+    if float((rotation * articulation.levers_mm).max()) < _STILL * model.stddev[0]:
+        return RelativePose("removed", ())
+    joints = [
+        JointSpread(model.parts[joint.part], model.parts[joint.parent], math.degrees(turn), shift)
+        for joint, turn, shift in zip(articulation.joints, rotation.tolist(), translation.tolist(), strict=True)
+    ]
+    return RelativePose("kept" if model.is_linear else "modelled", tuple(joints))
+
+
+def _spread(poses: list[PartPoses], field: Literal["rotation", "translation"]) -> FloatArray:
+    """Return the root of the sum of the squares of a coordinate (P - 1, 3) over modes and axes, (P - 1,)."""
+    return np.sqrt(sum((getattr(pose, field) ** 2).sum(axis=1) for pose in poses))

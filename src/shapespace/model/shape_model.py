@@ -384,6 +384,17 @@ class ShapeModel:
         return {name: len(self.regions[name]) for name in self.parts}
 
     @property
+    def vertices_of_parts(self) -> dict[str, IntArray]:
+        """Vertices of each part by its name; empty if the surface is one structure."""
+        return {name: self.regions[name] for name in self.parts}
+
+    @property
+    def part_of_vertex(self) -> IntArray | None:
+        """(V,) index of the part of each vertex; None if the surface is one structure."""
+        counts = list(self.part_counts.values())
+        return np.repeat(np.arange(len(counts), dtype=np.int32), counts) if counts else None
+
+    @property
     def articulation(self) -> Articulation | None:
         """The parts with their joints, if their relative pose is modelled."""
         return self._coder.parts if isinstance(self._coder, Articulated) else None

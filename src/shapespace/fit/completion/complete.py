@@ -41,7 +41,7 @@ from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.interop import MeshLike
 from shapespace.io.landmarks.landmark_io import read_landmarks
 from shapespace.io.memory_cache import cached_with_owner
-from shapespace.model.region import ModelRegion
+from shapespace.model.region import ModelRegion, relative_pose
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import describe_briefly
 from shapespace.types import BoolArray, FloatArray, IntArray, Mesh, Similarity
@@ -318,7 +318,7 @@ class Completion:
 
 def complete(
     model: ShapeModel | str | PathLike[str],
-    scan: MeshLike,
+    scan: MeshLike | Mapping[str, MeshLike],
     config: CompletionConfig | None = None,
     *,
     landmarks: Mapping[str, FloatArray] | str | PathLike[str] | None = None,
@@ -328,7 +328,7 @@ def complete(
 
     Args:
         model: the shape model, or the path of its file.
-        scan: a mesh or point cloud, in its own frame and unit, or its path.
+        scan: a mesh or point cloud, in its own frame and unit, or its path; or parts with their scans, see `fit_scan`.
         config: settings; None for the defaults.
         landmarks: landmarks of the scan, see `fit_scan`; they may lie on missing parts.
         T_scan_model: initial pose, see `fit_scan`.
@@ -344,6 +344,8 @@ def complete(
         raise InputError(
             f"The model was built from {model.n_training} shapes; a completion needs one of at least {_FEWEST_SHAPES}."
         )
+    if isinstance(scan, Mapping) and len(scan) == 1:
+        config = replace(config, fit=config.fit.for_scan(model, f"_{next(iter(scan))}"))
     landmarks = read_landmarks(Path(landmarks)) if isinstance(landmarks, str | PathLike) else landmarks
     if config.fit.region is not None and config.fit.region not in model.parts:
         of_parts = f"one of the parts {', '.join(model.parts)}" if model.parts else "no region"
@@ -355,7 +357,10 @@ def complete(
             model, _remove_part(fit, config.part), config.fit, landmarks=landmarks, T_scan_model=T_scan_model
         )
     T_mm_scan = mm_frame(fit.scan, fit.mm_per_scan_unit)
-    target = ScanTarget(fit.scan.with_vertices(T_mm_scan.apply(fit.scan.vertices)))
+    scan_mm, part = fit.scan.with_vertices(T_mm_scan.apply(fit.scan.vertices)), config.fit.region
+    if part is not None:
+        scan_mm = replace(scan_mm, parts=np.full(len(scan_mm.vertices), model.parts.index(part), dtype=np.int32))
+    target = ScanTarget(scan_mm, None if scan_mm.parts is None else model.part_of_vertex)
     marks = None
     if landmarks:
         landmarks, _ = landmarks_in_frame_of(fit.scan, landmarks)  # as in the fit, whose notes state it
@@ -364,7 +369,7 @@ def complete(
         marks_mm = {name: T_mm_scan.apply(point) for name, point in landmarks.items()}
         marks = LandmarkConstraint.of(model, marks_mm, stddev_mm)
     with_scale = config.fit.limits(model).with_scale
-    if config.fit.region is not None:
+    if part is not None and not model.is_linear:
         return _complete_from_part(fit, target, T_mm_scan, config)
 
     def posterior_at(fit: FitResult, *, calibrated: bool = True) -> ShapePosterior:
@@ -379,7 +384,7 @@ def complete(
     assert evidence is not None
     stands_out = evidence.start_score_mm < _STANDS_OUT * evidence.start_runner_up_score_mm
     is_sure = fit.status != "doubtful" and evidence.seen_share > (_SURE / 2 if stands_out else _SURE)
-    if not landmarks and T_scan_model is None and not is_sure:
+    if not landmarks and T_scan_model is None and scan_mm.parts is None and not is_sure:
         fit, apart_mm = _find_likeliest_pose(
             fit, target, T_mm_scan.inverse(), config, lambda fit: posterior_at(fit, calibrated=False)
         )
@@ -393,6 +398,10 @@ def complete(
     calibration = calibrate(posterior, model, ~observed)
     status, reasons = _judge_completion(fit, posterior, calibration, dense.noise_mm, apart_mm, config)
     notes = [*fit.notes, *_describe_missing_parts(model, fit, observed, with_scale=with_scale)]
+    if scan_mm.parts is not None and (pose := relative_pose(model)) is not None and pose.choice == "removed":
+        notes.append(
+            "The relative pose was removed from the model: other parts are in their mean pose, whose spread is unknown."
+        )
     completed = T.inverse().apply(dense.vertices_scan_mm)
     variance = np.einsum("vii->v", posterior.vertex_covariance())
     if calibration is None:

@@ -244,6 +244,7 @@ class Matcher:
         engine: search structure of the scan.
         normal_cosine: cosine of the largest angle between the normals of an allowed match.
         bulging: whether flat triangles represent the smooth surface through their corners.
+        parts: (M,) part of each point; None if unknown.
     """
 
     target: ScanTarget
@@ -254,6 +255,7 @@ class Matcher:
     engine: ClosestPointEngine
     normal_cosine: float
     bulging: bool = False
+    parts: IntArray | None = None
 
     @staticmethod
     def of(
@@ -273,6 +275,7 @@ class Matcher:
             engine=engine,
             normal_cosine=normal_cosine,
             bulging=bulging,
+            parts=None if target.mesh.parts is None else target.mesh.parts[points],
         )
 
     def first_hint(
@@ -286,10 +289,15 @@ class Matcher:
             tree: search tree of the vertices of a similar surface; None to build one.
             winding: -1 if the normals of the scan are reversed, else 1; None if unknown.
         """
+        used, points = surface.topology.used, self._in_model(T_scan_model)
+        if self.target.part_of_vertex is not None:
+            # A walk does not leave its part, so that the first match determines the part of all.
+            tree = KdTree(surface.vertices[used] + self.target.vertex_shift(used))
+            points = points + self.target.shift(self.parts)
         tree = tree or surface.vertex_tree()
-        vertex = np.empty(len(self.points_mm), dtype=np.int32)
-        nearest = tree.nearest(self._in_model(T_scan_model)[self.order])[0]
-        vertex[self.order] = surface.topology.used[nearest]
+        vertex = np.empty(len(points), dtype=np.int32)
+        nearest = tree.nearest(points[self.order])[0]
+        vertex[self.order] = used[nearest]
         return MatchHint(vertex, np.full_like(vertex, -1), None, winding)
 
     def _in_model(self, T: Similarity) -> FloatArray:
@@ -347,13 +355,16 @@ def match_vertices(
         normal_cosine: cosine of the largest angle between the normals of an allowed match.
     """
     T, x, n = T_scan_model, surface.vertices[vertex], surface.normals[vertex]
-    near = engine.query(T.apply(x), near)
-    to_scan = x - ((near.points - T.translation) @ T.rotation) / T.scale
+    shift = target.vertex_shift(vertex)
+    near = engine.query(T.apply(x) + shift, near)
+    to_scan = x - ((near.points - shift - T.translation) @ T.rotation) / T.scale
     corners, weights = target.carriers(near)
     n_scan, allowed, residual = np.empty_like(x), np.empty(len(x), dtype=np.bool_), np.empty(len(x))
     on_scan_into(corners, weights, target.normals, target.rim, n_scan, allowed)
     n_scan = n_scan @ T.rotation if target.mesh.faces is not None else n_scan[:0]
     compare_into(to_scan, n, n_scan, winding, normal_cosine, residual, allowed)
+    if target.shown is not None:
+        allowed &= target.shown[vertex]
     return VertexMatches(vertex, residual, near.distance / T.scale, allowed, near)
 
 

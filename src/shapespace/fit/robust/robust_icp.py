@@ -62,11 +62,12 @@ from shapespace.fit.robust.robust_settings import Level, RobustSettings
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.search.initialisation import Start
 from shapespace.geometry.closest import on_boundary
+from shapespace.geometry.contact import find_overlaps, find_penetrations
 from shapespace.geometry.kdtree import KdTree
 from shapespace.geometry.normals import rms_size
 from shapespace.geometry.similarity import POSE, small_similarity
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import FloatArray, IntArray, Similarity
+from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 
 _MOTION_STRIDE = 7  # every seventh vertex measures the motion of an iteration, at a seventh of the cost
 _FEWEST_MATCHES = 30  # matches; fewer cannot estimate pose and leading modes robustly
@@ -75,6 +76,9 @@ _CLEARLY_BETTER = 0.95  # ratio of mismatches for which an alternative replaces 
 _FARTHEST = 5.0  # multiple of the reach beyond which points are not matched
 _HALF, _LEADING, _NEAR = 0.5, 10, 0.05
 """Weight above which a match counts, number of leading modes, and share of the model's size that counts as near."""
+_STIFF, _TOUCH = 100.0, 1e-9
+"""Weight of a vertex inside another part, in units of a match: 1.5 mm become 0.04 mm or less (10: 0.4 mm); and the
+smallest depth, mm, that has a direction."""
 _LACK_LEFT = 0.5
 """Share of the variance outside the model that is added, so that landmarks lie within their standard deviations
 (docs/landmarks.md)."""
@@ -149,6 +153,7 @@ class Problem:
         prior: prior of pose and shape.
         shape: shape model that computes surfaces from coefficients.
         marks: landmarks, if any.
+        no_contact: whether parts must not lie inside each other.
     """
 
     prepared: PreparedModel
@@ -157,6 +162,7 @@ class Problem:
     prior: Prior
     shape: LinearShape
     marks: LandmarkConstraint | None = None
+    no_contact: bool = False
 
     @staticmethod
     def of(
@@ -227,6 +233,19 @@ class Problem:
         gain = weighted.sigma_mm**2 * worth(float(weights.points.sum() + weights.vertices.sum()))  # R16d
         return gathered, replace(equations, gradient=equations.gradient + gain * gradient, H_landmarks=gain * hessian)
 
+    def contact_equations(self, surface: ModelSurface, equations: NormalEquations) -> NormalEquations:
+        """Return the equations with the penalty of vertices inside other parts: their squared depths (S11)."""
+        H, gradient = equations.H.copy(), equations.gradient.copy()
+        modes = surface.modes[:, :, : len(gradient) - POSE]
+        parts = self.prepared.model.vertices_of_parts
+        for _, _, vertex, corners, near in find_overlaps(Mesh(surface.vertices, surface.topology.faces), parts):
+            outwards = (near.points - surface.vertices[vertex]) / np.maximum(near.distance, _TOUCH)[:, None]
+            moved = modes[vertex] - np.einsum("mc,mcdk->mdk", near.barycentric, modes[corners])
+            rows = np.einsum("md,mdk->mk", outwards, moved)
+            H[POSE:, POSE:] += _STIFF * rows.T @ rows
+            gradient[POSE:] -= _STIFF * rows.T @ near.distance
+        return replace(equations, H=H, gradient=gradient)
+
     def step(self, matcher: Matcher, iterate: Iterate, hint: MatchHint, modes: int) -> Step:
         """Return one Gauss-Newton step on the pose and the first `modes` coefficients.
 
@@ -235,6 +254,7 @@ class Problem:
         """
         weighted = self.match(matcher, iterate, hint)  # R4-R9
         _, equations = self.equations(weighted, iterate, modes)  # R10-R14
+        equations = self.contact_equations(iterate.surface, equations) if self.no_contact else equations
         try:
             delta = equations.step()  # R15
         except LinAlgError as error:
@@ -354,8 +374,26 @@ def robust_icp(
         problem = problem.with_residual_modes()
         progress = yield from _extend_with_residual_modes(problem, progress, tree, max_iterations)
         weighted = problem.match(progress.matcher, progress.iterate, progress.hint)
+    notes: tuple[str, ...] = ()
+    if settings.no_contact and (before_mm := depth_mm(problem, progress.iterate)) > 0.0:
+        problem, level = replace(problem, no_contact=True), settings.levels[-1]
+        steps = problem.descent(progress.matcher, progress.iterate, progress.hint, level)
+        progress = yield from _yield_states(steps, progress, level, max_iterations)
+        weighted = problem.match(progress.matcher, progress.iterate, progress.hint)
+        notes = (
+            f"Parts lay inside each other by up to {before_mm:.2f} mm, and by up to "
+            f"{depth_mm(problem, progress.iterate):.2f} mm after contact was forbidden.",
+        )
     yield progress.state
-    return _summarise(problem, progress.iterate, weighted, unexplained_mm2, modes)
+    fitted = _summarise(problem, progress.iterate, weighted, unexplained_mm2, modes)
+    return replace(fitted, notes=(*fitted.notes, *notes))
+
+
+def depth_mm(problem: Problem, iterate: Iterate) -> float:
+    """Return the largest depth of a vertex of one part inside another, mm of the scan; 0 without such vertices."""
+    surface = Mesh(iterate.surface.vertices, iterate.surface.topology.faces)
+    found = find_penetrations(surface, problem.prepared.model.vertices_of_parts)
+    return iterate.T_scan_model.scale * max((penetration.depth_mm for penetration in found), default=0.0)
 
 
 def _coarse_to_fine(

@@ -8,6 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from shapespace.errors import FitError
 from shapespace.fit.diagnostics.failure_model import (
     FitEvidence,
     ScanEvidence,
@@ -27,6 +28,9 @@ from shapespace.fit.scan_target import ScanTarget
 from shapespace.fit.search.initialisation import Start
 from shapespace.model.shape_model import ShapeModel
 
+_STEPS_OF_JOINTS = 4
+"""Factor of the iterations of each level if relative poses are modelled; with 1, half of the fits of a femur and a
+fifth of a tibia stop too early."""
 _COMPLETE = 0.95  # share of the vertices; a complete scan still omits vertices at its border
 
 
@@ -78,11 +82,16 @@ class Robust(RobustSettings):
             find_second_instance,
         )
 
+        if self.no_contact and not (model.parts or limits.part):
+            raise FitError("The model has one part, which no other part can be in contact with; omit --no-contact.")
+        # Joints that turn need more steps; a level still ends as soon as nothing moves.
+        more = 1 if model.is_linear else _STEPS_OF_JOINTS
+        levels = tuple(replace(level, iterations=more * level.iterations) for level in self.levels)
         fitted = yield from robust_icp(
             model,
             scan,
             start,
-            self,
+            replace(self, levels=levels),
             with_scale=limits.with_scale,
             modes=limits.modes,
             max_iterations=limits.max_iterations,

@@ -78,6 +78,8 @@ class RobustSettings:
         prior: weight of the prior relative to one match.
         beyond_prior: weight of the prior of the residual modes relative to one match.
         scale_stddev: standard deviation of log s about the start.
+        no_contact: whether closed parts of a model must not lie inside each other: at the end of the fit, the depths of
+            vertices inside another part are penalised.
         seed: seed of the subsamples.
     """
 
@@ -103,6 +105,7 @@ class RobustSettings:
     prior: float = 0.3
     beyond_prior: float = 1.0
     scale_stddev: float = 0.15
+    no_contact: bool = False
     seed: int = 0
 
 

@@ -124,7 +124,7 @@ def _compare(
     if ratio > _CLEARLY_WORSE:
         return -_PATCHES * math.log(min(ratio, 1e6)), None
     faces = None if scan.faces is None else scan.faces[:, ::-1]
-    mirror = ScanTarget(Mesh(reflected, faces, name=scan.name))
+    mirror = replace(target, mesh=Mesh(reflected, faces, name=scan.name, parts=scan.parts))
     start = Start(unscaled.inverse() @ mirrored_pose.T_scan_model, "given", float("nan"), mirrored_pose.b)
     try:
         mirror_fit = last_of(robust_icp(model, mirror, start, settings, with_scale=with_scale))
@@ -154,10 +154,10 @@ def _cost(model: ShapeModel, target: ScanTarget, fitted: Fitted) -> float:
     scale = fitted.T_scan_fitted.scale
     cap = _CAP * rms_size(model.mean_vertices) * scale
     points = target.mesh.vertices[target.draw(_POINTS, np.random.default_rng(0))]
-    vertices = fitted.vertices_scan_mm[:: max(1, model.n_vertices // _VERTICES)]
+    some = slice(None, None, max(1, model.n_vertices // _VERTICES))
     ways = (
         build_engine(Mesh(fitted.vertices_scan_mm, model.faces)).query(points).distance,
-        target.engine.query(vertices).distance,
+        target.engine.query(fitted.vertices_scan_mm[some] + target.vertex_shift(some)).distance,
     )
     rms = sum(float(np.sqrt((np.minimum(way, cap) ** 2).mean())) for way in ways) / scale
     prior_cost = float((fitted.b**2 / variance_of_new_shapes(model)[: len(fitted.b)]).sum())

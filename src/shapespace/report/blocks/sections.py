@@ -17,6 +17,7 @@ import numpy as np
 from shapespace.errors import ShapespaceError
 from shapespace.fit.paper.paper_method import Paper
 from shapespace.fit.robust.robust_settings import DenseSettings, ResidualSettings, RobustSettings
+from shapespace.model.region import JointSpread, relative_pose
 from shapespace.model.shape_model import ShapeModel
 from shapespace.report import figures
 from shapespace.report.blocks.blocks import (
@@ -59,7 +60,7 @@ from shapespace.report.inputs.saved_fits import (
     StagedFit,
     measured_mm,
 )
-from shapespace.report.inputs.subject_parts import JointSpread, Parts, relative_pose
+from shapespace.report.inputs.subject_parts import Parts
 from shapespace.report.pages.page import OrderedPicture, Page
 from shapespace.report.render import thumbnails
 from shapespace.report.render.scene import pack_fit, pack_model, pack_scatter, pack_surfaces

@@ -24,8 +24,9 @@ from shapespace.cohort.orientation import current_orientation
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.normals import drawable
 from shapespace.geometry.remesh import collapse
+from shapespace.model.region import articulation_of
 from shapespace.report.inputs.saved_fits import StagedFit, mean_mm, measured_mm
-from shapespace.report.inputs.subject_parts import Parts, articulation_of
+from shapespace.report.inputs.subject_parts import Parts
 from shapespace.report.render import palette as colours
 from shapespace.schemas import FitRecord, to_json
 from shapespace.types import FloatArray, IntArray, Mesh
