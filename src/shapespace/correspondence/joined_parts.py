@@ -21,7 +21,7 @@ from shapespace.correspondence.odd_scans import ScanMeasures
 from shapespace.correspondence.scan_status import SurfaceMeasures
 from shapespace.correspondence.settings import FEWEST, SIZE
 from shapespace.errors import InputError
-from shapespace.geometry.articulation import Articulation, articulate, size_of_parts
+from shapespace.geometry.articulation import Articulation, articulate
 from shapespace.geometry.mirror_plane import FLIP, mirror_image
 from shapespace.geometry.normals import faces_of, rms_size
 from shapespace.geometry.similarity import fit_similarity
@@ -30,10 +30,13 @@ from shapespace.types import FloatArray, Mesh, Similarity, SurfaceLandmarks
 
 _TO_STDDEV = 1.4826  # MAD to standard deviation of a normal distribution: 1 / 0.6745
 _FALSE_RATE = 0.05
-"""Share of collections without odd specimens, with normal values, in which one is found by chance."""
+"""Share of collections without odd specimens in which one is found by chance, for values with a Laplace distribution:
+sizes and poses multiply, so relative poses have longer tails than normal values. Of 300 collections of 6, 12, 20, 40 or
+80 simulated limbs 4 %, none, 1 %, none and 1 % had a false finding, and an error of 100 mm or of a random rotation was
+found in 95 to 99 %; with normal values 7, 16, 24, 55 and 82 % had one."""
 _SIMULATED = 400  # collections that determine the limit of unusual values
 _NO_FRAME = 0.01  # rate at which rotations without any common relative pose are taken for such with one
-_SAME_POSE = 1e-6  # spread of relative poses below which all are equal, rad and share of the size
+_SAME_POSE = 1e-6  # spread of relative poses below which all are equal, rad and mm
 
 
 def join_parts(parts: Mapping[str, Correspondence], *, doubts: Mapping[str, str] | None = None) -> Correspondence:
@@ -119,9 +122,9 @@ def robust_z(values: FloatArray) -> FloatArray:
 
 @cache
 def outlier_limit(count: int, columns: int) -> float:
-    """Return the limit that the largest of `robust_z` of normal values (count, columns) exceeds in 5 % of all cases."""
+    """Return the limit that 5 % of the maxima of `robust_z` of Laplace values (count, columns) exceed."""
     rng = np.random.default_rng(0)
-    largest = [float(robust_z(rng.standard_normal((count, columns))).max()) for _ in range(_SIMULATED)]
+    largest = [float(robust_z(rng.laplace(size=(count, columns))).max()) for _ in range(_SIMULATED)]
     return float(np.quantile(largest, 1 - _FALSE_RATE))
 
 
@@ -295,16 +298,14 @@ class _PoseCheck:
         self._names = [name for name in joint.names if len(joint.present[name]) > 1]
         joints, labels = self.articulation.joints, list(joint.counts)
         self._pairs = [(labels[j.part], labels[j.parent]) for j in joints]
-        mean_size = size_of_parts(self.articulation.template, counts)
         rows: list[FloatArray] = []
-        self._scales: list[float] = []
         for name in self._names:
-            vertices = joint.placed(name, self.articulation.template)[0]
-            self._scales.append(size_of_parts(vertices, counts) / mean_size)
-            poses = self.articulation.poses_of(vertices / self._scales[-1])
+            unit = joint.scans[name][joint.present[name][0]].unit_ratio
+            vertices = joint.placed(name, self.articulation.template)[0] / unit
+            poses = self.articulation.poses_of(vertices)
             sizes = [rms_size(vertices[s]) for s in self.articulation.slices]
             ratio = [np.log(sizes[j.part] / sizes[j.parent]) for j in joints]
-            row = np.column_stack([poses.rotation, poses.translation / rms_size(self.articulation.template), ratio])
+            row = np.column_stack([poses.rotation, poses.translation, ratio])
             row[[not {*pair} <= {*joint.present[name]} for pair in self._pairs]] = np.nan
             rows.append(row)
         self._values = np.stack(rows)
@@ -321,10 +322,9 @@ class _PoseCheck:
                 continue
             at, column = np.unravel_index(int(np.nanargmax(z[k])), z[k].shape)
             off, (part, parent) = self._values[k, at] - middle[at], self._pairs[at]
-            length = float(np.linalg.norm(off[3:6])) * self._scales[k] * rms_size(self.articulation.template)
             how = (
                 f"rotated by {np.rad2deg(np.linalg.norm(off[:3])):.3g} degrees from its usual pose" if column < 3
-                else f"{length:.3g} (unit of the scan) from its usual place" if column < 6
+                else f"{np.linalg.norm(off[3:6]):.3g} (unit of most scans) from its usual place" if column < 6
                 else f"{np.exp(off[6]):.3g} times as large as usual"
             )  # fmt: skip
             found[name] = (
