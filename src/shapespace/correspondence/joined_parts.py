@@ -142,6 +142,40 @@ def _on_one_side(parts: Mapping[str, Correspondence]) -> dict[str, Correspondenc
     return on_one_side
 
 
+def _sides_of_specimens(parts: Mapping[str, Correspondence]) -> dict[str, bool]:
+    """Return whether most parts of each specimen are mirror images; doubtful parts count only if all are doubtful."""
+    votes: dict[str, list[tuple[bool, bool]]] = {scan.name: [] for own in parts.values() for scan in own.scans}
+    for own in parts.values():
+        for scan in own.scans:
+            if own.sides_decided and not scan.reason:
+                votes[scan.name].append((bool(scan.doubt), scan.mirrored))
+    sides = {name: [side for doubtful, side in own if doubtful == min(own)[0]] for name, own in votes.items()}
+    return {name: 2 * sum(own) + (own or [False])[0] > len(own) for name, own in sides.items()}
+
+
+def find_wrong_sides(parts: Mapping[str, Correspondence]) -> dict[str, frozenset[str]]:
+    """Return the parts with scans that may be on a wrong side, and the specimens that are mirrored by all their parts.
+
+    A scan that is on another side than the other parts of its specimen may be on the wrong side if its surface is
+    doubtful, or if the sides of its part were not decided. Otherwise it shows the other side of a body.
+
+    Args:
+        parts: correspondence of each part by name, with scans of one name for one specimen.
+    """
+    parts = _on_one_side(parts)
+    sides = _sides_of_specimens(parts)
+    mirrored = frozenset(name for name, side in sides.items() if side)
+    return {
+        part: mirrored
+        for part, own in parts.items()
+        if any(
+            scan.mirrored != sides[scan.name] and (scan.doubt or not own.sides_decided)
+            for scan in own.scans
+            if not scan.reason
+        )
+    }
+
+
 class _PartScans:
     """The scans of all parts by specimen."""
 
@@ -155,8 +189,9 @@ class _PartScans:
             name: [part for part, scan in own.items() if scan.vertices is not None] for name, own in self.scans.items()
         }
         self._doubts = {name: [doubts[name]] if name in doubts else [] for name in self.names}
-        self.mirrored = {name: self._side(name) for name in self.names}
+        self.mirrored = _sides_of_specimens(parts)
         for name in self.names:
+            self._doubt_sides(name)
             self._doubt_units(name)
         self.complete = self._find_complete()
         starts = dict(zip(parts, np.cumsum([0, *self.counts.values()]).tolist(), strict=False))
@@ -174,18 +209,13 @@ class _PartScans:
             )
         )
 
-    def _side(self, name: str) -> bool:
-        """Return whether most parts of a specimen are mirrored, and doubt it if they disagree."""
-        own = self.scans[name]
-        decided = [part for part in self.present[name] if self.parts[part].sides_decided]
-        votes = [own[part].mirrored for part in decided]
-        mirrored = bool(votes) and (votes[0] if 2 * sum(votes) == len(votes) else 2 * sum(votes) > len(votes))
+    def _doubt_sides(self, name: str) -> None:
+        own, mirrored = self.scans[name], self.mirrored[name]
         if other := [part for part in self.present[name] if own[part].mirrored != mirrored]:
             is_image = ("is", "are not") if own[other[0]].mirrored else ("is not", "are")
             self._doubts[name].append(
                 f"{' and '.join(other)} {is_image[0]} a mirror image of the majority and its other parts {is_image[1]}"
             )
-        return mirrored
 
     def _doubt_units(self, name: str) -> None:
         ratios = {part: self.scans[name][part].unit_ratio for part in self.present[name]}
@@ -237,15 +267,14 @@ class _PartScans:
     def joined(self, name: str, mean: FloatArray, doubt: str) -> Corresponding:
         """Return the joined scan of a specimen; `doubt` is about its relative pose."""
         own = self.scans[name]
-        notes = tuple(f"{part}: {sentence}" for part, scan in own.items() for sentence in scan.notes)
-        missing = [part for part in self.parts if part not in own]
-        if missing:
-            notes = (*notes, f"It has no scan of {' and '.join(missing)}.")
+        missing = " and ".join(part for part in self.parts if part not in own)
+        notes = [f"{part}: {sentence}" for part, scan in own.items() for sentence in scan.notes]
+        notes += [f"It has no scan of {missing}."] if missing else []
         if excluded := [f"{part}: {scan.reason}" for part, scan in own.items() if scan.reason]:
-            return Corresponding(name, "; ".join([*self._doubts[name], *excluded]), notes=notes)
+            return Corresponding(name, "; ".join([*self._doubts[name], *excluded]), notes=tuple(notes))
         vertices, T = self.placed(name, mean)
-        doubts = [*self._doubts[name], *([doubt] if doubt else [])]
-        doubts += [f"{part}: {scan.doubt}" for part, scan in own.items() if scan.doubt]
+        of_parts = [f"{part}: {scan.doubt}" for part, scan in own.items() if scan.doubt]
+        doubts = [*self._doubts[name], *([doubt] if doubt else []), *of_parts]
         scans, weights = list(own.values()), [self.counts[part] for part in own]
 
         def average(values: Sequence[float | None]) -> float:
@@ -275,7 +304,7 @@ class _PartScans:
             position_std=np.concatenate(std) if len(std) == len(self.parts) else None,
             measures=SurfaceMeasures(**dict(zip(SurfaceMeasures.__annotations__, worst, strict=True))),
             review=tuple(reversed({reason.code: reason for reason in reasons}.values())),
-            notes=notes, unit_ratio=scans[0].unit_ratio, area_share=area if np.isfinite(area) else None,
+            notes=tuple(notes), unit_ratio=scans[0].unit_ratio, area_share=area if np.isfinite(area) else None,
         )  # fmt: skip
 
     def remarks(self) -> list[str]:

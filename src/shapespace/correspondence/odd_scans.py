@@ -63,7 +63,7 @@ class ScanMeasures:
             corners = mesh.vertices[mesh.faces[rng.choice(len(areas), _POINTS, p=areas / areas.sum())]]
             points = np.einsum("nk,nkd->nd", rng.dirichlet(np.ones(3), _POINTS), corners)
         size = rms_size(points)
-        return ScanMeasures(size, np.quantile(cdist(*np.split(points, 2)), _QUANTILES) / size)
+        return ScanMeasures(size, np.quantile(cdist(points[: _POINTS // 2], points[_POINTS // 2 :]), _QUANTILES) / size)
 
 
 @dataclass(frozen=True)
