@@ -1,17 +1,25 @@
 """Are several structures of one subject brought into correspondence as well as one, and is their relative pose kept?
 
-    python benchmarks/structures.py                       20 simulated limbs with femur, tibia and fibula
+    python benchmarks/structures.py                       20 simulated limbs with femur, tibia, fibula and pelvis
     python benchmarks/structures.py --limbs 60 --vertices 3000
     python benchmarks/structures.py fits --limbs 12       fits with given parts and with parts that are found
-
+    python benchmarks/structures.py models                a model of shape and pose, and one of stacked vertices
+    python benchmarks/structures.py unusual --limbs 300   false and true findings of unusual relative poses
 
 Limbs are samples of a published model of the pelvis and the lower limb (../shared/data/lower_limb, for tests only),
-with a knee that is flexed by 0 to 40 degrees. The bones of a limb are raw scans in one frame: each has triangles of its
-own, 0.2 mm of noise, and the limb has any pose and size. `correspond --parts` is compared with each bone alone. The
-error of the relative pose is that of each bone against the femur, by the true places of the vertices.
+whose bones are moved to the gaps of the mean, and whose knee is flexed by 0 to 40 degrees. The bones of a limb are raw
+scans in one frame: each has triangles of its own, 0.2 mm of noise, and the limb has any pose and size. `correspond
+--parts` is compared with each bone alone. The error of the relative pose is that of each bone against the femur, by the
+true places of the vertices. The same error is stated for the exact surfaces without noise, to which the true mean is
+fitted rigidly: less is not to be expected, since vertices of the published model slide about the axis of slender bones,
+which their surfaces do not show.
 
 `fits` builds a model of 60 limbs with true correspondences and fits it to new limbs of which 20 % of the points are
 missing, and whose bones are at most 2 mm apart: to one scan of all bones in any pose, and to one scan per bone.
+`models` compares the errors of 15 new limbs, with the same number of modes, over five collections of 60 limbs.
+`unusual` looks for relative poses in collections of 6, 12, 20 and 40 clean limbs, and in the same ones with a tibia
+that is rotated at random and moved by 100 mm in each direction (standard deviation); --limbs is then the number of
+collections.
 """
 
 from __future__ import annotations
@@ -20,9 +28,10 @@ import argparse
 import json
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -31,6 +40,8 @@ from scipy.spatial.transform import Rotation
 from correspondence import Known, Set, dispersion
 from shapespace.cli import main as shapespace
 from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
+from shapespace.correspondence.joined_parts import join_parts
+from shapespace.correspondence.scan_status import SurfaceMeasures
 from shapespace.correspondence.template import clean_scan
 from shapespace.datasets.simulated_scan import random_similarity, simulate_scan
 from shapespace.fit.fit_scan import fit_scan
@@ -38,15 +49,17 @@ from shapespace.geometry.closest import build_engine
 from shapespace.geometry.normals import faces_of, part_of
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
-from shapespace.model.build_model import BuildConfig, build_model
+from shapespace.model.build_model import BuildConfig, RelativePose, build_model
 from shapespace.model.shape_model import ShapeModel
-from shapespace.types import IntArray, Mesh, Similarity
+from shapespace.types import FloatArray, IntArray, Mesh, Similarity
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "lower_limb"
-BONES = {"femur": "Fem_R", "tibia": "Tib_R", "fibula": "Fib_R"}
+BONES = {"femur": "Fem_R", "tibia": "Tib_R", "fibula": "Fib_R", "pelvis": "Pel_R"}
 FLEXION_DEG = 40.0
 TRIANGLES, NOISE_MM = 6000, 0.2
-TRAINING, MISSING, HOLE_MM, GAP_MM = 60, 0.2, 25.0, 1.5
+TRAINING, HELD, MISSING, HOLE_MM, GAP_MM = 60, 15, 0.2, 25.0, 1.5
+POINTS, STEPS = 1500, 60  # of the rigid fits of exact surfaces
+DRAWN, SPARSE = 1000, 60  # limbs from which collections are drawn, and vertices of each of their bones
 
 
 class Limbs:
@@ -68,12 +81,30 @@ class Limbs:
             self.means[bone] = clean_scan(Mesh(mean[own], (faces[inside] - own.start).astype(np.int32), name=bone))
             self._vertices_of[bone] = cKDTree(mean[own]).query(self.means[bone].vertices)[1] + own.start
         self._knee = ranges["Fem_R"].start + np.loadtxt(DATA / "knee_node_nrs_femur_right.txt", dtype=int)
+        self._near = {
+            bone: (self._nearest(bone, "femur"), self._nearest("femur", bone)) for bone in ("tibia", "pelvis")
+        }
+        means = {bone: mean.vertices for bone, mean in self.means.items()}
+        self._gap = {bone: self._gap_of(means, bone) for bone in self._near}
+
+    def _nearest(self, bone: str, other: str) -> IntArray:
+        """Return the twentieth of a bone's vertices that is nearest to another bone."""
+        distance = cKDTree(self.means[other].vertices).query(self.means[bone].vertices)[0]
+        return np.argsort(distance)[: len(distance) // 20]
+
+    def _gap_of(self, bones: dict[str, FloatArray], bone: str) -> FloatArray:
+        own, femur = self._near[bone]
+        return bones[bone][own].mean(axis=0) - bones["femur"][femur].mean(axis=0)
 
     def draw(self, rng: np.random.Generator) -> dict[str, Mesh]:
         """Return the bones of a random limb, mm."""
         b = np.clip(rng.standard_normal(self._model.n_modes), -2.5, 2.5) * self._model.stddev
         vertices = self._model.mesh(b).vertices
         bones = {bone: vertices[own] for bone, own in self._vertices_of.items()}
+        # Bones of large samples of the model are 60 mm apart or inside each other (standard deviation).
+        for bone, moving in (("tibia", ("tibia", "fibula")), ("pelvis", ("pelvis",))):
+            off = self._gap_of(bones, bone) - self._gap[bone]
+            bones |= {own: bones[own] - off for own in moving}
         knee = vertices[self._knee].mean(axis=0)
         flexed = Rotation.from_rotvec([np.deg2rad(rng.uniform(0.0, FLEXION_DEG)), 0, 0]).as_matrix()
         for bone in ("tibia", "fibula"):
@@ -109,14 +140,41 @@ def surfaces(folder: Path, names: Sequence[str], template: Mesh) -> Corresponden
     return Correspondence(template, tuple(scans), "", ())
 
 
+def rigid_fit(points: FloatArray, surface: Mesh, T: Similarity) -> Similarity:
+    """Return the similarity of `points` (N, 3) to a surface by ICP from `T`."""
+    engine = build_engine(surface)
+    for _ in range(STEPS):
+        T = fit_similarity(points, engine.query(np.ascontiguousarray(T.apply(points))).points)
+    return T
+
+
+Poses = list[tuple[Similarity, Similarity] | None]
+
+
+def error_of(own: Poses, femur: Poses, mean: Mesh) -> dict[str, float]:
+    """Return the median errors of the pose of a bone relative to the femur: degrees, degrees of its long axis, and mm
+    at its centre; from its estimated and true poses and those of the femur."""
+    centre, errors = mean.vertices.mean(axis=0), list[tuple[float, float, float]]()
+    axis = np.linalg.svd(mean.vertices - centre, full_matrices=False)[2][0]
+    for bone, reference in zip(own, femur, strict=True):
+        if bone is None or reference is None:
+            continue
+        a, b = (reference[i].inverse() @ bone[i] for i in (0, 1))
+        change = Rotation.from_matrix(a.rotation.T @ b.rotation)
+        of_axis = np.arccos(np.clip(axis @ change.apply(axis), -1, 1))
+        off = float(np.linalg.norm(a.apply(centre) - b.apply(centre)))
+        errors.append((float(np.rad2deg(change.magnitude())), float(np.rad2deg(of_axis)), off))
+    return dict(zip(("degrees", "degrees_of_axis", "mm"), np.median(errors, axis=0).tolist(), strict=True))
+
+
 def relative_pose_errors(limbs: Limbs, known: dict[str, list[Known]], same: Path) -> dict[str, dict[str, float]]:
-    """Return the median errors of the pose of each bone relative to the femur, degrees and mm at its centre.
+    """Return the median errors of the pose of each bone relative to the femur, and those of exact surfaces.
 
     The pose of a bone is the rigid fit of its mean surface, on the vertices of the correspondence, to the surface; the
     true pose is the fit of the same points of the true mean to the true bone.
     """
-    errors: dict[str, list[tuple[float, float]]] = {bone: [] for bone in BONES if bone != "femur"}
-    poses: dict[str, list[tuple[Similarity, Similarity] | None]] = {}
+    poses: dict[str, Poses] = {}
+    exact: dict[str, Poses] = {}
     for bone, scans in known.items():
         mean = limbs.means[bone]
         names = [f"limb{k:02d}" for k in range(len(scans))]
@@ -130,26 +188,58 @@ def relative_pose_errors(limbs: Limbs, known: dict[str, list[Known]], same: Path
         middle = np.median(places, axis=0)
         near = build_engine(mean).query(np.ascontiguousarray(middle))
         corners = faces_of(mean)[near.triangle]
-        poses[bone] = []
+        points = mean.vertices[:: max(1, len(mean.vertices) // POINTS)]
+        poses[bone], exact[bone] = [], []
         for scan, own in zip(made.scans, scans, strict=True):
+            T = fit_similarity(mean.vertices, own.truth)
+            exact[bone].append((rigid_fit(points, Mesh(own.truth, mean.faces), T), T))
             if scan.vertices is None:
                 poses[bone].append(None)
                 continue
             truth = np.einsum("mc,mcd->md", near.barycentric, own.truth[corners])
             poses[bone].append((fit_similarity(middle, scan.vertices), fit_similarity(middle, truth)))
-    for bone, found in errors.items():
-        centre = limbs.means[bone].vertices.mean(axis=0)
-        for own, femur in zip(poses[bone], poses["femur"], strict=True):
-            if own is None or femur is None:
-                continue
-            # Relative pose in the frame of the femur: estimated and true.
-            a, b = (femur[i].inverse() @ own[i] for i in (0, 1))
-            angle = Rotation.from_matrix(a.rotation @ b.rotation.T).magnitude()
-            found.append((float(np.rad2deg(angle)), float(np.linalg.norm(a.apply(centre) - b.apply(centre)))))
-    return {
-        bone: dict(zip(("degrees", "mm"), np.median(found, axis=0).tolist(), strict=True))
-        for bone, found in errors.items()
-    }
+    found: dict[str, dict[str, float]] = {}
+    for bone, mean in limbs.means.items():
+        if bone != "femur":
+            found[bone] = error_of(poses[bone], poses["femur"], mean)
+            found[f"{bone}, exact surfaces"] = error_of(exact[bone], exact["femur"], mean)
+    return found
+
+
+def unusual_poses(limbs: Limbs, collections: int, seed: int) -> dict[str, dict[str, float]]:
+    """Return the share of clean collections with a finding, and that of found errors, by the number of limbs."""
+    drawn = [limbs.draw(np.random.default_rng([seed, k])) for k in range(DRAWN)]
+    bones = ("femur", "tibia", "fibula")
+    rows = {bone: np.linspace(0, len(limbs.means[bone].vertices) - 1, SPARSE).astype(int) for bone in bones}
+    good = SurfaceMeasures(distance=0.01, folded=0, missing=0, unreached=0, area_change=1.1, not_settled=0.001)
+    face, found = np.array([[0, 1, 2]], np.int32), dict[str, dict[str, float]]()
+    for count in (6, 12, 20, 40):
+        rng, false, true = np.random.default_rng(seed), 0, 0
+        for _ in range(collections):
+            own = [drawn[k] for k in rng.choice(DRAWN, count, replace=False)]
+            vertices = {bone: [np.array(limb[bone].vertices[rows[bone]]) for limb in own] for bone in bones}
+            wrong = Similarity(1.0, Rotation.random(random_state=rng).as_matrix(), rng.normal(0, 100, 3))
+            for is_wrong in (False, True):
+                if is_wrong:
+                    vertices["tibia"][0] = wrong.apply(vertices["tibia"][0])
+                parts = {
+                    bone: Correspondence(
+                        Mesh(every[0], face),
+                        tuple(
+                            Corresponding(
+                                f"limb{k}", "", x, Similarity.identity(), 1.0, 1.0, (0.0, 0.0, 0.0, 0.0), (0.01,),
+                                (1.0,), status="converged", measures=good,
+                            )
+                            for k, x in enumerate(every)
+                        ), "", (0.01,),
+                    )
+                    for bone, every in vertices.items()
+                }  # fmt: skip
+                doubtful = [scan.name for scan in join_parts(parts).scans if scan.doubt]
+                true += is_wrong and "limb0" in doubtful
+                false += not is_wrong and bool(doubtful)
+        found[str(count)] = {"false": false / collections, "true": true / collections}
+    return found
 
 
 def thinned(mesh: Mesh, count: int) -> tuple[IntArray, IntArray]:
@@ -228,20 +318,63 @@ def fits_with_given_and_found_parts(limbs: Limbs, count: int, seed: int, vertice
     }  # fmt: skip
 
 
+def stacked_and_jointed(limbs: Limbs, seeds: int, numbers: Sequence[int]) -> list[dict[str, float]]:
+    """Return the errors of limbs that are not in a model of shape and pose, and in one of stacked vertices.
+
+    Args:
+        limbs: limbs, `TRAINING` for each model and `HELD` for its error.
+        seeds: number of collections.
+        numbers: numbers of modes.
+
+    Returns:
+        For each number of modes the mean RMS distance of vertices, mm, of both models, and their ratio.
+    """
+    errors: dict[str, list[list[float]]] = {"kept": [], "modelled": []}
+    parts = {bone: len(mean.vertices) for bone, mean in limbs.means.items()}
+    for seed in range(seeds):
+        rng = np.random.default_rng([seed, 3])
+        drawn = [np.concatenate([bone.vertices for bone in limbs.draw(rng).values()]) for _ in range(TRAINING + HELD)]
+        meshes = [Mesh(vertices, name=f"limb{k:02d}") for k, vertices in enumerate(drawn)]
+        for pose, found in errors.items():
+            model = build_model(
+                meshes[:TRAINING], BuildConfig(parts=parts, relative_pose=cast(RelativePose, pose), gauge="form")
+            )
+            found.append([])
+            for number in numbers:
+                own = model.truncate(number)
+                made = [own.reconstruct(own.project(mesh)).reshape(-1, 3) for mesh in meshes[TRAINING:]]
+                found[-1].append(float(np.mean([_rms(*pair) for pair in zip(made, drawn[TRAINING:], strict=True)])))
+    means = {pose: np.mean(found, axis=0) for pose, found in errors.items()}
+    return [
+        {"modes": number, "stacked_mm": a, "jointed_mm": b, "ratio": b / a}
+        for number, a, b in zip(numbers, means["kept"].tolist(), means["modelled"].tolist(), strict=True)
+    ]
+
+
+def _rms(vertices: FloatArray, truth: FloatArray) -> float:
+    off = fit_similarity(vertices, truth, with_scale=False).apply(vertices) - truth
+    return float(np.sqrt((off**2).sum(axis=1).mean()))
+
+
 def main() -> None:
     """Run the benchmark and print its figures as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", nargs="?", choices=("correspondence", "fits"), default="correspondence")
+    parser.add_argument(
+        "what", nargs="?", choices=("correspondence", "fits", "models", "unusual"), default="correspondence"
+    )
     parser.add_argument("--limbs", type=int, default=20)
     parser.add_argument("--vertices", type=int, default=1500)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--folder", type=Path, help="folder of scans and results (default: a temporary one)")
     asked = parser.parse_args()
     limbs, start = Limbs(), time.perf_counter()
-    if asked.what == "fits":
-        print(
-            json.dumps(fits_with_given_and_found_parts(limbs, asked.limbs, asked.seed, asked.vertices // 3), indent=2)
-        )
+    others: dict[str, Callable[[], object]] = {
+        "fits": lambda: fits_with_given_and_found_parts(limbs, asked.limbs, asked.seed, asked.vertices // 3),
+        "models": lambda: stacked_and_jointed(limbs, 5, (3, 5, 8, 11, 15)),
+        "unusual": lambda: unusual_poses(limbs, asked.limbs, asked.seed),
+    }
+    if asked.what in others:
+        print(json.dumps(others[asked.what](), indent=2))
         return
     with tempfile.TemporaryDirectory() as temporary:
         folder: Path = asked.folder or Path(temporary)

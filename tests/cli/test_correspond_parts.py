@@ -11,12 +11,17 @@ from scipy.spatial.transform import Rotation
 from conftest import Run
 from raw_blobs import raw_blob
 from shapespace.cli import main
+from shapespace.commands import correspond
 from shapespace.commands.inputs import Given, given_scans, scans_of_parts
+from shapespace.correspondence import CorrespondConfig, Correspondence, Corresponding
+from shapespace.correspondence.scan_status import SurfaceMeasures
 from shapespace.errors import InputError
+from shapespace.geometry.mirror_plane import FLIP
 from shapespace.io.meshes.mesh_io import read_mesh, write_mesh
 from shapespace.model.shape_model import ShapeModel
 from shapespace.store.corresponding import surface_files
 from shapespace.types import Mesh, Similarity
+from synthetic_shapes import sphere
 
 pytestmark = pytest.mark.usefixtures("few_modes")
 PARTS = ("ball", "cup")
@@ -84,6 +89,44 @@ def test_other_commands_take_the_folder_as_any_other(run: Run, same: Path, tmp_p
     assert ShapeModel.load(tmp_path / "m.h5").n_vertices == summary(same)["vertices"]
     pytest.importorskip("matplotlib", reason="the extra `report` is not installed")
     assert run("report", same, "-o", tmp_path / "r.html", "--no-open", "--quiet").code == 0
+
+
+def test_a_part_with_wrong_sides_is_brought_into_correspondence_again_with_those_of_its_specimens(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    directions, faces = sphere(40, 0.0)
+    measures = SurfaceMeasures(distance=0.01, folded=0, missing=0, unreached=0, area_change=1, not_settled=0)
+    rng, given = np.random.default_rng(0), list[list[Mesh]]()
+    scans = {(k, part): Mesh(directions * (1 + 0.1 * rng.random(3)), faces) for k in range(4) for part in PARTS}
+    (tmp_path / "raw").mkdir()
+    for (k, part), mesh in scans.items():
+        write_mesh(tmp_path / "raw" / f"s{k}_{part}.ply", mesh)
+
+    def as_given(meshes: list[Mesh], config: CorrespondConfig, **_: object) -> Correspondence:
+        """Return the vertices of the scans; the second part is unsure of the side of s1 while it decides itself."""
+        given.append(meshes)
+        is_unsure = len(given) == 2
+        same = [
+            Corresponding(
+                mesh.name, "", mesh.vertices, Similarity.identity(), 1.0, 1.0, (0.0, 0.0, 0.0, 0.0), (0.01,), (1.0,),
+                mirrored=config.mirror == "auto" and mesh.name == "s1" and not is_unsure, status="converged",
+                doubt="odd" if is_unsure and mesh.name == "s1" else "", measures=measures,
+            )
+            for mesh in meshes
+        ]  # fmt: skip
+        return Correspondence(meshes[0], tuple(same), "s0.", (0.01,), sides_decided=config.mirror == "auto")
+
+    monkeypatch.setattr(correspond, "first_template", lambda *_: None)
+    monkeypatch.setattr(correspond, "correspond", as_given)
+    folder = tmp_path / "same"
+    assert run("correspond", tmp_path / "raw", "--parts", *PARTS, "-o", folder, "--quiet").code == 0
+    assert len(given) == 3 and np.allclose(given[2][1].vertices, given[1][1].vertices * FLIP)
+    assert summary(folder)["mirrored"] == ["s1"]
+    assert not (folder / "s1.correspond.json").read_text("utf-8").count("mirror image")
+    found = read_mesh(folder / "s1.corresponding.ply").vertices
+    assert np.allclose(found, np.concatenate([scans[1, part].vertices for part in PARTS]), atol=1e-5)
+    assert run("correspond", tmp_path / "raw", "--parts", *PARTS, "-o", folder, "--quiet").code == 0
+    assert len(given) == 3, "a second run computes nothing"
 
 
 def test_folders_with_other_parts_are_not_mixed(run: Run, same: Path, tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from shapespace.correspondence import Correspondence, Corresponding, join_parts
-from shapespace.correspondence.joined_parts import find_exchanged, outlier_limit, robust_z
+from shapespace.correspondence.joined_parts import find_exchanged, find_wrong_sides, outlier_limit, robust_z
 from shapespace.correspondence.odd_scans import ScanMeasures
 from shapespace.correspondence.scan_status import SurfaceMeasures
 from shapespace.errors import InputError
@@ -144,6 +144,17 @@ def test_a_mirrored_specimen_is_reflected_as_a_whole_and_sides_that_disagree_are
     assert "tibia is not a mirror image" in doubts(join_parts(with_scan(parts, "tibia", "k4", mirrored=False)))["k4"]
 
 
+def test_sides_of_which_a_part_is_unsure_are_those_of_the_other_parts_of_the_specimen() -> None:
+    assert not find_wrong_sides(knees())
+    other_side = with_scan(knees(), "tibia", "k4", mirrored=True)
+    assert not find_wrong_sides(other_side), "a tibia that is clearly of the other side stays a contradiction"
+    assert find_wrong_sides(with_scan(other_side, "tibia", "k4", doubt="it is odd")) == {"tibia": frozenset()}
+    parts = with_scan(knees(), "femur", "k4", mirrored=True)
+    assert find_wrong_sides(with_scan(parts, "tibia", "k4", doubt="it is odd")) == {"tibia": {"k4"}}
+    undecided = replace(parts["tibia"], sides_decided=False)
+    assert find_wrong_sides(parts | {"tibia": undecided}) == {"tibia": {"k4"}}
+
+
 def test_a_part_whose_template_is_on_the_other_side_is_reflected() -> None:
     parts, usual = knees(), join_parts(knees())
     tibia = parts["tibia"]
@@ -165,25 +176,34 @@ def test_too_few_specimens_with_all_parts_are_one_sentence() -> None:
         join_parts({"femur": parts["femur"]})
 
 
-def measures(count: int, *, swapped: str = "") -> dict[str, dict[str, ScanMeasures]]:
-    """Return the measures of both bones of knees."""
-    found: dict[str, dict[str, ScanMeasures]] = {part: {} for part in AXES}
-    for i in range(count):
-        own, name = knee(i), f"k{i}"
-        order = list(AXES)[::-1] if name == swapped else list(AXES)
-        for part, shown in zip(AXES, order, strict=True):
-            found[part][name] = ScanMeasures.of(Mesh(own[shown], FACES))
-    return found
+def test_a_specimen_in_another_unit_has_its_usual_relative_pose() -> None:
+    parts = knees(k5={part: 0.001 * x for part, x in knee(5).items()})
+    for part in AXES:
+        parts = with_scan(parts, part, "k5", unit_ratio=0.001)
+    assert not doubts(join_parts(parts))
 
 
 def test_exchanged_parts_are_named_and_no_others() -> None:
-    assert not find_exchanged(measures(12))
-    found = find_exchanged(measures(12, swapped="k7"))
+    own = {part: {f"k{i}": ScanMeasures.of(Mesh(knee(i)[part], FACES)) for i in range(12)} for part in AXES}
+    assert not find_exchanged(own)
+    own["femur"]["k7"], own["tibia"]["k7"] = own["tibia"]["k7"], own["femur"]["k7"]
+    found = find_exchanged(own)
     assert set(found) == {"k7"} and "femur and tibia are probably exchanged" in found["k7"]
 
 
-def test_one_collection_in_twenty_has_a_false_finding() -> None:
+@pytest.mark.parametrize("count", [6, 12, 40])
+def test_at_most_one_collection_in_twenty_has_a_false_finding_if_sizes_multiply_poses(count: int) -> None:
+    rng, columns = np.random.default_rng(1), 14
+    limit = outlier_limit(count, columns)
+    sizes = np.exp(0.3 * rng.standard_normal((300, count, 1)))
+    poses = sizes * rng.standard_normal((300, count, columns))
+    assert np.mean([robust_z(own).max() > limit for own in poses]) <= 0.05
+    poses[0, 0, 0] = 50.0
+    assert robust_z(poses[0])[0, 0] > limit
+
+
+def test_the_limit_of_unusual_values_is_exceeded_in_one_of_twenty_collections_of_long_tails() -> None:
     rng, count, columns = np.random.default_rng(1), 20, 7
     limit = outlier_limit(count, columns)
-    rate = np.mean([robust_z(rng.standard_normal((count, columns))).max() > limit for _ in range(600)])
+    rate = np.mean([robust_z(rng.laplace(size=(count, columns))).max() > limit for _ in range(600)])
     assert 0.02 < rate < 0.09

@@ -68,6 +68,8 @@ class CorrespondFiles:
         subjects: column of the list of scans that names the subjects, or None.
         parts: names of the parts of each specimen, each with scans of its own; empty for objects of one part.
         part: name of the part whose scans are used.
+        mirrored: names of the scans that are mirror images of the majority, as other parts of their specimens show;
+            None if the scans show it.
     """
 
     scans: Sequence[str | Path]
@@ -80,6 +82,7 @@ class CorrespondFiles:
     subjects: str | None = None
     parts: Sequence[str] = ()
     part: str = ""
+    mirrored: frozenset[str] | None = None
 
 
 def correspond_files(
@@ -104,7 +107,9 @@ def correspond_files(
         marks.check_not_shared([job.scan for job in jobs if job.landmarks is None])
         subjects = _subjects_of(jobs, files.subjects)
         inputs_hash = inputs_hash_of(jobs, marks, files, config)
-        if (finished := results.finished(inputs_hash, [job.name for job in jobs])) is not None:
+        if files.mirrored is not None:
+            say("The sides of these scans are those of the other parts of their specimens.")
+        elif (finished := results.finished(inputs_hash, [job.name for job in jobs])) is not None:
             say(f"{results.path} already contains the results of these scans and settings; nothing is computed.")
             return finished
         template = None if files.template is None else marks.onto(read_mesh(files.template), files.template)
@@ -116,16 +121,17 @@ def correspond_files(
                 f"{len(several)} of {len(read.scans)} scans have several separate pieces, and the first template has "
                 "only the largest; if the pieces are structures of one subject, give a file for each, and --parts."
             )
-        without_inner = replace(config, outer=False)  # the scans that are read are without inner surfaces
+        # The scans that are read are without inner surfaces, and of known sides or compared.
+        own = replace(config, outer=False, mirror=config.mirror if files.mirrored is None else "never")
 
         def make(rounds: RoundsWithProgress) -> Correspondence:
-            scans = list(read.scans.values())
+            mirrored = files.mirrored or ()
+            scans = [mirror_image(scan) if name in mirrored else scan for name, scan in read.scans.items()]
             with waiting("choosing the template", quiet=quiet):
-                first = first_template(scans, template, without_inner, model)
+                first = first_template(scans, template, own, model)
             of_scans = [subjects[name] for name in read.scans] if subjects else []
-            return correspond(
-                scans, without_inner, template=template, model=model, first=first, subjects=of_scans, run=rounds
-            )
+            made = correspond(scans, own, template=template, model=model, first=first, subjects=of_scans, run=rounds)
+            return made if files.mirrored is None else made.with_sides(mirrored)
 
         made, records = bring(jobs, read, marks, files, results, make, quiet=quiet, say=say)
         # Until all is written, build must not accept the folder.

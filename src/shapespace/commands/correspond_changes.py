@@ -337,15 +337,15 @@ def _correspond_parts(
     def run(own: CorrespondFiles, folder: Path) -> FinishedFolder:
         if not change:
             correspond_files(own, folder, config, quiet=quiet, say=say)
-            return FinishedFolder.of(CorrespondenceFolder(folder))
-        known = CorrespondenceFolder(folder).read()[1]
-        of_part = replace(
-            change,
-            redo=[name for name in change.redo if name in known],
-            remove=[name for name in change.remove if name in known],
-        )
-        if of_part and (find_jobs(own, folder, say) if own.scans and change.add else True):
-            change_correspondence(of_part, own, folder, config, quiet=quiet, say=say)
+        elif own.mirrored is None:
+            known = CorrespondenceFolder(folder).read()[1]
+            of_part = replace(
+                change,
+                redo=[name for name in change.redo if name in known],
+                remove=[name for name in change.remove if name in known],
+            )
+            if of_part and (find_jobs(own, folder, say) if own.scans and change.add else True):
+                change_correspondence(of_part, own, folder, config, quiet=quiet, say=say)
         return FinishedFolder.of(CorrespondenceFolder(folder))
 
     if change:

@@ -21,7 +21,7 @@ from shapespace.commands.correspond import (
 from shapespace.commands.finished_correspondence import FinishedFolder
 from shapespace.commands.inputs import given_scans, scans_of_parts
 from shapespace.correspondence.correspondence_result import Correspondence, Corresponding
-from shapespace.correspondence.joined_parts import find_exchanged, join_parts
+from shapespace.correspondence.joined_parts import find_exchanged, find_wrong_sides, join_parts
 from shapespace.correspondence.odd_scans import ScanMeasures
 from shapespace.correspondence.scan_status import SurfaceMeasures
 from shapespace.correspondence.settings import FEWEST
@@ -89,12 +89,16 @@ def correspond_each_part(
     for part in files.parts:
         say(f"Part {part}:")
         finished[part] = run(replace(files, part=part), folder / part)
+    parts = {part: _correspondence(own) for part, own in finished.items()}
+    for part, mirrored in find_wrong_sides(parts).items():
+        finished[part] = run(replace(files, part=part, mirrored=mirrored), folder / part)
+        parts[part] = _correspondence(finished[part])
     with CorrespondenceFolder(make_folder(folder)).writing() as results:
         inputs_hash = " ".join(f"{part} {own.summary.results_hash}" for part, own in finished.items())
         names = list(dict.fromkeys(name for own in finished.values() for name in own.records))
         if (earlier := results.finished(inputs_hash, names)) is not None:
             return earlier
-        made = join_parts({part: _correspondence(own) for part, own in finished.items()}, doubts=_doubts(finished))
+        made = join_parts(parts, doubts=_doubts(finished))
         for sentence in made.notes:
             say(sentence)
         size = rms_size(made.template.vertices)

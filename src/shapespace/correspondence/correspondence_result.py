@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -188,6 +188,16 @@ class Correspondence:
             for scan in self.scans
             if scan.vertices is not None
         ]
+
+    def with_sides(self, mirrored: Collection[str]) -> Correspondence:
+        """Return this correspondence, of the mirror images of the scans that `mirrored` names, as that of the scans."""
+        scans = [
+            scan
+            if scan.vertices is None or scan.name not in mirrored
+            else replace(scan, mirrored=True, vertices=scan.vertices * FLIP)
+            for scan in self.scans
+        ]
+        return replace(self, scans=tuple(scans), sides_decided=True)
 
     def _mesh(self, scan: Corresponding, vertices: FloatArray) -> Mesh:
         observed = np.ones(len(vertices), dtype=np.bool_) if scan.observed is None else scan.observed

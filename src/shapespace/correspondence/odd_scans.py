@@ -9,6 +9,7 @@ from itertools import permutations, product
 
 import numpy as np
 from scipy.spatial import KDTree
+from scipy.spatial.distance import cdist
 
 from shapespace.correspondence.correspondence_result import ENOUGH_TO_COMPARE, LEAST_RATIO, OTHER_SIZE, unit_ratios
 from shapespace.geometry.mirror_plane import ASYMMETRIC, FLIP
@@ -62,9 +63,7 @@ class ScanMeasures:
             corners = mesh.vertices[mesh.faces[rng.choice(len(areas), _POINTS, p=areas / areas.sum())]]
             points = np.einsum("nk,nkd->nd", rng.dirichlet(np.ones(3), _POINTS), corners)
         size = rms_size(points)
-        first, second = np.split(points, 2)
-        distances = np.linalg.norm(first[:, None] - second, axis=2)
-        return ScanMeasures(size, np.quantile(distances, _QUANTILES) / size)
+        return ScanMeasures(size, np.quantile(cdist(points[: _POINTS // 2], points[_POINTS // 2 :]), _QUANTILES) / size)
 
 
 @dataclass(frozen=True)

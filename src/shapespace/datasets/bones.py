@@ -126,26 +126,52 @@ def write_bones(
         InputError: a count or an effect out of range.
         FileError: the folder cannot be written.
     """
-    if not 2 <= count <= _MOST:
-        raise InputError(f"The number of bones must be between 2 and {_MOST}, not {count}.")
     if not -10.0 <= effect_mm <= 10.0:
         raise InputError(f"The effect must be between -10 and 10 mm, not {effect_mm:g}.")
-    make_folder(folder)
+
+    def write(k: int, group: int) -> str:
+        rng = np.random.default_rng([seed, k, 1])
+        scan = raw_surface(Bone.draw(np.random.default_rng([seed, k]), effect_mm * group), rng, _POINTS)
+        scan = _with_hole(scan, rng) if k % _CUT_EVERY == _CUT_EVERY - 1 else scan
+        write_mesh(folder / f"bone_{k:03d}.ply", scan)
+        return f"bone_{k:03d}.ply"
+
+    return write_two_groups(folder / TABLE, ("file", "group"), GROUPS, write, count=count, progress=progress)
+
+
+def write_two_groups(
+    table: Path,
+    columns: tuple[str, str],
+    groups: tuple[str, str],
+    write: Callable[[int, int], str],
+    *,
+    count: int,
+    progress: Callable[[], object] | None,
+) -> Path:
+    """Write simulated specimens of two groups alternately, and their table; return its folder.
+
+    Args:
+        table: the table; its folder is created if it does not exist.
+        columns: names of its two columns, for specimens and groups.
+        groups: names of the groups.
+        write: function of the number of a specimen and of its group that writes the specimen and returns its name.
+        count: number of specimens, 2 to 10,000.
+        progress: function called after each specimen.
+
+    Raises:
+        InputError: a count out of range.
+        FileError: a file cannot be written.
+    """
+    if not 2 <= count <= _MOST:
+        raise InputError(f"The number of specimens must be between 2 and {_MOST}, not {count}.")
+    make_folder(table.parent)
     rows: list[tuple[str, str]] = []
     for k in range(count):
-        group = k % len(GROUPS)
-        rng = np.random.default_rng([seed, k, 1])
-        bone = Bone.draw(np.random.default_rng([seed, k]), effect_mm * group)
-        scan = raw_surface(bone, rng, _POINTS)
-        if k % _CUT_EVERY == _CUT_EVERY - 1:
-            scan = _with_hole(scan, rng)
-        name = f"bone_{k:03d}.ply"
-        write_mesh(folder / name, scan)
-        rows.append((name, GROUPS[group]))
+        rows.append((write(k, k % 2), groups[k % 2]))
         if progress is not None:
             progress()
-    write_rows(folder / TABLE, ("file", "group"), rows)
-    return folder
+    write_rows(table, columns, rows)
+    return table.parent
 
 
 def _with_hole(scan: Mesh, rng: np.random.Generator) -> Mesh:

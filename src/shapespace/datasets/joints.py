@@ -13,11 +13,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from shapespace.datasets.bones import write_two_groups
 from shapespace.datasets.organs import raw_surface_in_its_frame
 from shapespace.errors import InputError
-from shapespace.io.files import make_folder
 from shapespace.io.meshes.mesh_io import write_mesh
-from shapespace.io.tables.table_io import write_rows
 from shapespace.types import FloatArray, Mesh
 
 TABLE = "joints.csv"
@@ -25,7 +24,7 @@ GROUPS = ("rest", "training")
 """The second group has the larger flexion."""
 EFFECT_DEGREES = 12.0  # difference of the mean flexion between the groups
 _FLEXION_DEGREES = 30.0  # range of the flexion within a group
-_POINTS, _MOST = 1500, 10_000  # points of a bone; largest number of subjects
+_POINTS = 1500  # of a bone
 _GAP_MM = 2.0  # between the bones at the joint
 
 # Of the upper and of the lower bone: half axes, mm, and bumps: x, y, z of the direction, width, height in mm.
@@ -106,19 +105,13 @@ def write_joints(
         InputError: a count or an effect out of range.
         FileError: the folder cannot be written.
     """
-    if not 2 <= count <= _MOST:
-        raise InputError(f"The number of subjects must be between 2 and {_MOST}, not {count}.")
     if not -60.0 <= effect_degrees <= 60.0:
         raise InputError(f"The effect must be between -60 and 60 degrees, not {effect_degrees:g}.")
-    make_folder(folder)
-    rows: list[tuple[str, str]] = []
-    for k in range(count):
-        rng, group = np.random.default_rng([seed, k]), k % len(GROUPS)
-        flexion = rng.uniform(0.0, _FLEXION_DEGREES) + effect_degrees * group
-        for part, mesh in draw_joint(rng, flexion).items():
+
+    def write(k: int, group: int) -> str:
+        rng = np.random.default_rng([seed, k])
+        for part, mesh in draw_joint(rng, rng.uniform(0.0, _FLEXION_DEGREES) + effect_degrees * group).items():
             write_mesh(folder / f"knee_{k:03d}_{part}.ply", mesh)
-        rows.append((f"knee_{k:03d}", GROUPS[group]))
-        if progress is not None:
-            progress()
-    write_rows(folder / TABLE, ("specimen", "group"), rows)
-    return folder
+        return f"knee_{k:03d}"
+
+    return write_two_groups(folder / TABLE, ("specimen", "group"), GROUPS, write, count=count, progress=progress)

@@ -172,14 +172,19 @@ class Articulation:
 
     def from_tangent(self, tangent: FloatArray) -> PartPoses:
         """Return the poses of tangent vertices (V, 3); the inverse of `to_tangent`."""
-        off = tangent - self.template
-        shape, theta = np.empty_like(off), np.empty((len(self.counts), 3))
+        poses = self._first_order((tangent - self.template)[None])
+        return PartPoses(poses.shape[0], poses.rotation[:, 0], poses.translation[:, 0])
+
+    def _first_order(self, off: FloatArray) -> PartPoses:
+        """Return the poses of displacements (K, V, 3) to first order: shapes (K, V, 3), and (P - 1, K, 3) at joints."""
+        shape, theta = np.empty_like(off), np.empty((len(self.counts), len(off), 3))
         for k, s in enumerate(self.slices):
-            theta[k] = _rotation_of(off[s], self._centred[k], self._inertia[k])
-            shape[s] = off[s] - off[s].mean(axis=0) - np.cross(theta[k], self._centred[k])
+            theta[k] = np.cross(self._centred[k], off[:, s]).sum(axis=1) @ self._inertia[k]
+            turned = np.cross(theta[k][:, None], self._centred[k])
+            shape[:, s] = off[:, s] - off[:, s].mean(axis=1, keepdims=True) - turned
         rotation = [theta[j.part] - theta[j.parent] for j in self.joints]
         translation = [
-            off[j.own].mean(axis=0) - off[j.other].mean(axis=0) - np.cross(theta[j.parent], gap)
+            off[:, j.own].mean(axis=1) - off[:, j.other].mean(axis=1) - np.cross(theta[j.parent], gap)
             for j, gap in zip(self.joints, self._gap, strict=True)
         ]
         return PartPoses(shape, np.array(rotation), np.array(translation))
@@ -219,7 +224,7 @@ class Articulation:
     def _without_motion(self, off: FloatArray) -> FloatArray:
         """Return displacements (V, 3) without the rigid motion of all parts together."""
         centred, inverse = self._all_parts
-        return off - off.mean(axis=0) - np.cross(_rotation_of(off, centred, inverse), centred)
+        return off - off.mean(axis=0) - np.cross(inverse @ np.cross(centred, off).sum(axis=0), centred)
 
     def encode(self, vertices: FloatArray) -> FloatArray:
         """Return the tangent vertices (V, 3) of a surface with `vertices` (V, 3) in any pose."""
@@ -243,23 +248,18 @@ class Articulation:
         """Return the derivatives (3V, K) of `decode` at `tangent` (V, 3) along the columns of `basis` (3V, K) (S7)."""
         V, K = len(self.template), basis.shape[1]
         off = np.ascontiguousarray(basis.T).reshape(K, V, 3)
-        poses = self.from_tangent(tangent)
+        poses, changes = self.from_tangent(tangent), self._first_order(off)
         vertices, R = self._compose(poses)
-        shape, theta = np.empty_like(off), np.empty((len(self.counts), K, 3))
-        for k, s in enumerate(self.slices):
-            theta[k] = np.cross(self._centred[k], off[:, s]).sum(axis=1) @ self._inertia[k]
-            shape[:, s] = (
-                off[:, s] - off[:, s].mean(axis=1, keepdims=True) - np.cross(theta[k][:, None], self._centred[k])
-            )
-        moved, spin = shape.copy(), np.zeros((len(self.counts), K, 3))
-        for j, gap, omega, d in zip(self.joints, self._gap, poses.rotation, poses.translation, strict=True):
+        moved, spin = changes.shape.copy(), np.zeros((len(self.counts), K, 3))
+        for k, (j, gap, omega, d) in enumerate(
+            zip(self.joints, self._gap, poses.rotation, poses.translation, strict=True)
+        ):
             s, parent = self.slices[j.part], R[j.parent]
-            d_omega = theta[j.part] - theta[j.parent]
-            d_gap = off[:, j.own].mean(axis=1) - off[:, j.other].mean(axis=1) - np.cross(theta[j.parent], gap)
-            spin[j.part] = spin[j.parent] + d_omega @ (parent @ _left_jacobian(omega)).T
+            spin[j.part] = spin[j.parent] + changes.rotation[k] @ (parent @ _left_jacobian(omega)).T
             own = vertices[s] - vertices[j.own].mean(axis=0)
-            moved[:, s] = shape[:, s] @ R[j.part].T + np.cross(spin[j.part][:, None], own)
-            joint = moved[:, j.other].mean(axis=1) + np.cross(spin[j.parent], parent @ (gap + d)) + d_gap @ parent.T
+            moved[:, s] = changes.shape[:, s] @ R[j.part].T + np.cross(spin[j.part][:, None], own)
+            turned = np.cross(spin[j.parent], parent @ (gap + d)) + changes.translation[k] @ parent.T
+            joint = moved[:, j.other].mean(axis=1) + turned
             moved[:, s] += (joint - moved[:, j.own].mean(axis=1))[:, None]
         return self._aligned_directions(vertices, moved).reshape(K, -1).T
 
@@ -276,11 +276,6 @@ class Articulation:
 
 def _inverse_inertia(x: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.inv((x**2).sum() * np.eye(3) - x.T @ x), dtype=np.float64)
-
-
-def _rotation_of(off: FloatArray, centred: FloatArray, inverse_inertia: FloatArray) -> FloatArray:
-    """Return the rotation vector (3,) of the small rigid motion that is nearest to displacements `off` (V, 3)."""
-    return inverse_inertia @ np.cross(centred, off).sum(axis=0)
 
 
 def size_of_parts(vertices: FloatArray, counts: Sequence[int]) -> float:
