@@ -511,7 +511,7 @@ COMMANDS: tuple[CommandSpec, ...] = (
             basic("--samples", "N", source=QUALITY, parse=values.positive),
             advanced("--no-align", help="use the meshes in their pose, without alignment", source=QUALITY),
             advanced("--representation", source=QUALITY_TARGETS, field="representations", nargs="+",
-                     choices=_REPRESENTATIONS, default=("vertices",)),
+                     choices=(*_REPRESENTATIONS, "articulated"), default=()),
             _jobs_option("folds"),
         ),
         (
