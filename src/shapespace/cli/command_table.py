@@ -1073,6 +1073,7 @@ COMMANDS: tuple[CommandSpec, ...] = (
             basic("--unit", "UNIT", "unit of the model, if its format does not contain it (default: mm)",
                   choices=_UNITS),
             advanced("--expressions", "FILE.bin", source=CONVERT),
+            advanced("--parts", "NAME", source=CONVERT, nargs="+"),
         ),
         ("Prints the parts that were kept, changed and omitted. Training shapes are always omitted.",),
     ),

@@ -9,7 +9,7 @@ MMBIA 2007), measured at the joints. Equation numbers are those of docs/structur
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -281,6 +281,12 @@ def _inverse_inertia(x: FloatArray) -> FloatArray:
 def _rotation_of(off: FloatArray, centred: FloatArray, inverse_inertia: FloatArray) -> FloatArray:
     """Return the rotation vector (3,) of the small rigid motion that is nearest to displacements `off` (V, 3)."""
     return inverse_inertia @ np.cross(centred, off).sum(axis=0)
+
+
+def regions_of_parts(counts: Mapping[str, int]) -> dict[str, IntArray]:
+    """Return the vertices (n,) of each part by its name, from the numbers of vertices, which follow one another."""
+    ends = np.cumsum([0, *counts.values()]).tolist()
+    return {name: np.arange(*bounds, dtype=np.int32) for name, bounds in zip(counts, pairwise(ends), strict=True)}
 
 
 def size_of_parts(vertices: FloatArray, counts: Sequence[int]) -> float:
