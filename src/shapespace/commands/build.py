@@ -261,8 +261,10 @@ def _load_parent(path: Path, output: Path) -> ShapeModel:
         raise InputError(f"{output} is the model that meshes are added to; give another name for the new model.")
     model = ShapeModel.load(path)
     if model.held_out or model.representation != "vertices":
-        what = "shapes and relative poses" if not model.is_linear else "B-spline surfaces"
-        reason = "separates identity and expression" if model.held_out else f"is of {what}"
+        reason = (
+            "separates identity and expression" if model.held_out
+            else "is of B-spline surfaces" if model.is_linear else "is of shapes and relative poses"
+        )  # fmt: skip
         raise InputError(f"{path} {reason}, and meshes can be added only to plain models of vertices; build it again.")
     return model
 

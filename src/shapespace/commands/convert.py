@@ -53,11 +53,8 @@ def convert(
         raise InputError(f"{output} is the model itself; give another name to write to.")
     with waiting(f"reading {source.name}", quiet=quiet):
         model, of, notes = _load_model(source, mm, expressions)
-        if parts and isinstance(model, ShapeModel):
-            regions = regions_of_parts(counts_of_pieces(model.faces, model.n_vertices, parts))
-            model = replace(model, regions={**model.regions, **regions}, parts=tuple(parts))
+        model, left_out = _model_to_write(model, parts)
         linear = model.as_linear()
-    model, left_out = _without_training_shapes(model)
     notes += left_out
     with waiting(f"writing {output.name}", quiet=quiet):
         if target is None:
@@ -83,16 +80,20 @@ def convert(
     return Outcome(facts, lines)
 
 
-def _without_training_shapes(
-    model: ShapeModel | AdditiveModel,
+def _model_to_write(
+    model: ShapeModel | AdditiveModel, parts: Sequence[str]
 ) -> tuple[ShapeModel | AdditiveModel, list[str]]:
-    """Return the model without its training shapes, which are not shared, and a sentence on that if it had some."""
-    shape = model if isinstance(model, ShapeModel) else model.shape
-    if shape.training is None:
-        return model, []
-    note = f"Omitted: {len(shape.training)} training shapes, so {NOT_CALIBRATED}."
+    """Return the model with named `parts`, if any, and without its training shapes, which are not shared, and a
+    sentence on that if it had some.
+    """
+    shape, notes = model if isinstance(model, ShapeModel) else model.shape, list[str]()
+    if shape.training is not None:
+        notes.append(f"Omitted: {len(shape.training)} training shapes, so {NOT_CALIBRATED}.")
+    if parts:
+        regions = regions_of_parts(counts_of_pieces(shape.faces, shape.n_vertices, parts))
+        shape = replace(shape, regions={**shape.regions, **regions}, parts=tuple(parts))
     shape = replace(shape, training=None)
-    return shape if isinstance(model, ShapeModel) else replace(model, shape=shape), [note]
+    return shape if isinstance(model, ShapeModel) else replace(model, shape=shape), notes
 
 
 def _target_format(output: Path, to: str | None) -> ModelFormat | None:

@@ -185,8 +185,7 @@ def _load_targets(
     for k, name in pairs:
         called = f"{_name(targets[k])}, {name}" if several else _name(targets[k])
         data, unit_ratios, parts = loaded[k]
-        own = _config_of_representation(config, name, names, parts)
-        out.append(_QualityInput(called, data, own, unit_ratios))
+        out.append(_QualityInput(called, data, _config_of_representation(config, name, names, parts), unit_ratios))
     if len(out) == _MOST_TARGETS and not any(isinstance(target.data, ShapeModel) for target in out):
         _check_same_shapes(out)
     return out
@@ -196,9 +195,12 @@ def _config_of_representation(
     config: QualityConfig, name: str, names: Sequence[str], parts: Mapping[str, int]
 ) -> QualityConfig:
     """Return the configuration of one representation; `vertices`, compared with B-splines, has no control points."""
-    splines = name != "vertices" or set(names) == {"vertices"}
-    counts = dict(parts) if name == "articulated" else None
-    return replace(config, representation=name, control_points=config.control_points if splines else None, parts=counts)
+    return replace(
+        config,
+        representation=name,
+        control_points=config.control_points if name != "vertices" or set(names) == {"vertices"} else None,
+        parts=dict(parts) if name == "articulated" else None,
+    )
 
 
 def _check_same_shapes(targets: Sequence[_QualityInput]) -> None:

@@ -285,8 +285,8 @@ def _rotation_of(off: FloatArray, centred: FloatArray, inverse_inertia: FloatArr
 
 def regions_of_parts(counts: Mapping[str, int]) -> dict[str, IntArray]:
     """Return the vertices (n,) of each part by its name, from the numbers of vertices, which follow one another."""
-    ends = np.cumsum([0, *counts.values()]).tolist()
-    return {name: np.arange(*bounds, dtype=np.int32) for name, bounds in zip(counts, pairwise(ends), strict=True)}
+    bounds = pairwise(np.cumsum([0, *counts.values()]).tolist())
+    return {name: np.arange(*ends, dtype=np.int32) for name, ends in zip(counts, bounds, strict=True)}
 
 
 def size_of_parts(vertices: FloatArray, counts: Sequence[int]) -> float:

@@ -192,15 +192,13 @@ def counts_of_pieces(faces: IntArray | None, n_vertices: int, names: Sequence[st
     Raises:
         InputError: the surface has another number of pieces, or the vertices of a piece do not follow one another.
     """
-    none = np.zeros((0, 3), dtype=np.int32)
-    pieces, piece = pieces_of(none if faces is None else faces, n_vertices)
+    pieces, piece = pieces_of(np.zeros((0, 3), dtype=np.int32) if faces is None else faces, n_vertices)
     starts = np.flatnonzero(np.diff(piece, prepend=-1))
     counts = np.diff(starts, append=n_vertices).tolist()
     if not pieces == len(starts) == len(set(names)) == len(names):
-        listed = ", ".join(map(str, counts[:_LISTED]))
         raise InputError(
             f"{len(names)} parts are named ({', '.join(names)}), and the surface has {pieces} separate pieces, whose "
-            f"vertices follow one another in runs of {listed}; give each piece a name of its own."
+            f"vertices follow one another in runs of {', '.join(map(str, counts[:_LISTED]))}; give each piece a name."
         )
     return dict(zip(names, counts, strict=True))
 

@@ -477,9 +477,8 @@ def measure_quality(
     if not included.all():
         meshes, new = [part_of(mesh, included) for mesh in meshes], [part_of(mesh, included) for mesh in new]
         if config.parts:
-            masks = np.split(included, np.cumsum(list(config.parts.values()))[:-1])
-            counts = {name: int(mask.sum()) for name, mask in zip(config.parts, masks, strict=True)}
-            config = replace(config, parts=counts)
+            masks = zip(config.parts, np.split(included, np.cumsum(list(config.parts.values()))[:-1]), strict=True)
+            config = replace(config, parts={name: int(mask.sum()) for name, mask in masks})
     shapes = Shapes(meshes, scans, config)
     return _measure_meshes(shapes, new, progress, run, left_out=int((~included).sum()))
 
@@ -609,11 +608,11 @@ def _errors_by_modes(model: ShapeModel, target: _Target, counts: IntArray, *, su
 
 def _onto_mean(model: ShapeModel, target: _Target) -> Similarity:
     """Return T_model_target, the pose of the target in the frame of the model."""
-    seen, scaled = target.seen, model.gauge == "shape"
     if not model.is_linear:
         # The mean shape in another relative pose determines neither pose nor size.
         return _in_best_pose(model, target, model.n_modes, Similarity.identity())[1]
-    return fit_similarity(target.shape.vertices[seen], model.mean_vertices[seen], with_scale=scaled)
+    there, mean = target.shape.vertices[target.seen], model.mean_vertices[target.seen]
+    return fit_similarity(there, mean, with_scale=model.gauge == "shape")
 
 
 def _in_best_pose(model: ShapeModel, target: _Target, k: int, T: Similarity) -> tuple[FloatArray, Similarity]:
@@ -624,8 +623,7 @@ def _in_best_pose(model: ShapeModel, target: _Target, k: int, T: Similarity) -> 
     shape, seen, total = target.shape.vertices, target.seen, model.total_variance
     left = max(total - float((model.stddev[:k] ** 2).sum()), _LEAST_NOISE * total)
     if not model.is_linear:
-        noise = left / shape.size if len(seen) < len(shape) else 0.0
-        scaled = model.gauge == "shape"
+        noise, scaled = left / shape.size if len(seen) < len(shape) else 0.0, model.gauge == "shape"
         b, T = model.nearest_in_any_pose(shape, with_scale=scaled, noise=noise, stddev=model.stddev[:k])
         return model.reconstruct(b), T.inverse()
     reconstructed = model.mean_vertices
@@ -693,10 +691,9 @@ def _compactness(model: ShapeModel, counts: IntArray, shapes: int) -> Curve:
         shapes: number of all training shapes; of many shapes the model keeps a sample.
     """
     assert model.training is not None
-    flat = model.training.coefficients
-    gram = flat @ flat.T
+    gram = model.training.coefficients @ model.training.coefficients.T
     share = model.cumulative_variance[np.minimum(counts, model.n_modes) - 1]
-    n, count = len(flat), min(model.vertex_basis.shape[1], model.n_modes)
+    n, count = len(gram), min(model.vertex_basis.shape[1], model.n_modes)
     rest = [np.flatnonzero(np.arange(n) != i) for i in range(n)]
     without = np.stack([_variance_shares(gram[np.ix_(some, some)], counts, count) for some in rest])
     spread = 1.96 * np.sqrt((n - 1) / shapes * ((without - without.mean(axis=0)) ** 2).sum(axis=0))

@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 
 from shapespace.geometry.articulation import Articulation, PartPoses
-from shapespace.model.representation import Articulated
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray
 
@@ -74,9 +73,7 @@ class RelativePose:
 
 def articulation_of(model: ShapeModel) -> Articulation:
     """Return the joints of a model of several parts: its own, or else those of its mean shape."""
-    if not model.is_linear:
-        return Articulated.from_arrays(model.coding).parts
-    return Articulation(model.mean_vertices, list(model.part_counts.values()))
+    return model.articulation or Articulation(model.mean_vertices, list(model.part_counts.values()))
 
 
 def relative_pose(model: ShapeModel) -> RelativePose | None:
