@@ -344,7 +344,7 @@ def _specimens_of(project: Project, shapes: Job | None, options: Mapping[str, An
     """Return the included specimens that a job with shapes has: fits are of new scans."""
     if shapes is not None and shapes.number == PLACED:
         placed = placed_landmarks(project, options)
-        return [one for one in project.state.chosen("training", with_parts=False) if one.id in placed.points]
+        return [row for row in project.state.chosen("training", with_parts=False) if row.id in placed.points]
     is_fit = shapes is not None and shapes.kind == "fit"  # of one scan each
     return project.state.chosen("new" if is_fit else "training", with_parts=is_fit)
 

@@ -52,7 +52,7 @@ _Made = TypeVar("_Made")
 
 _AGAIN = "restore it from a copy, or start a new project"
 _PART = "part"
-"""Column of a list of scans that names the structure on each of them."""
+"""Column of a list of scans that names the structure on each scan."""
 _MOST_CLASSES = 12  # classes of a column that the page counts
 LANDMARK_COLUMN = "landmarks"
 """Column of a list of scans that names their files of landmarks."""
@@ -180,7 +180,7 @@ class State(Struct, frozen=True, kw_only=True):
         """Return the included specimens of a role by name: the order in which they were added differs between drops.
 
         Args:
-            role: their role.
+            role: role of the specimens.
             with_parts: whether the further parts of specimens are among them.
         """
         of_role = self.specimens if with_parts else self.rows
@@ -821,7 +821,7 @@ def _rename(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
         raise InputError(f"A specimen cannot be called {new[:40]!r}, as files of results are called so.")
     if any(specimen.id.casefold() == new.casefold() for specimen in state.specimens if specimen.id != old):
         raise InputError(f"There is a specimen {new} already; choose another name.")
-    parts = tuple(replace(one, subject=new) if one.subject == old else one for one in state.specimens)
+    parts = tuple(replace(part, subject=new) if part.subject == old else part for part in state.specimens)
     state = replace(state, specimens=parts)
     return f"rename {old}", _edit_specimens(state, [old], lambda specimen: replace(specimen, id=new))
 
