@@ -10,10 +10,12 @@ import pytest
 from pages import PANE, viewer
 from pictures import same_as_kept
 from test_scene_in_browser import SHELL
+from test_studio_in_browser import WINDOW, User, studio
 
 import shapespace as ss
 from same_blobs import NAMES, write_same
 from shapespace.geometry.articulation import PartPoses
+from shapespace.io.meshes.mesh_io import write_mesh
 from shapespace.model.region import articulation_of
 from shapespace.report.render import palette, scene
 from shapespace.schemas import CorrespondenceRecord
@@ -184,4 +186,26 @@ def test_surfaces_in_correspondence_show_their_parts_and_marks_of_hidden_ones_ar
         page.get_by_test_id("part-second").check()
         assert page.evaluate(shown) == all_shown
         tab.shot("surfaces-exploded")
+        assert tab.complaints == []
+
+
+def test_scans_of_parts_become_one_card_per_specimen_by_clicks(open_tab, tmp_path: Path) -> None:
+    for mesh in two_part_surfaces(2, seed=4):
+        for k, part in enumerate(("femur", "tibia")):
+            vertices = mesh.vertices[k * VERTICES : (k + 1) * VERTICES]
+            own = replace(mesh, vertices=vertices, faces=mesh.faces[: len(mesh.faces) // 2])
+            write_mesh(tmp_path / f"{mesh.name}_{part}.ply", own)
+    with studio(tmp_path / "project", tmp_path) as address:
+        tab = open_tab(address, WINDOW)
+        user = User(tab)
+        user.sees("drop-zone")
+        tab.page.get_by_test_id("choose-files-input").set_input_files(sorted(tmp_path.glob("*.ply")))
+        tab.until("document.querySelectorAll('[data-testid^=card-] img').length === 4")
+        user.click("select-all")
+        user.click("parts-selected")
+        assert tab.page.get_by_test_id("parts-names").input_value() == "femur, tibia"
+        user.click("parts-join")
+        tab.until("document.querySelectorAll('[data-testid^=card-]').length === 2")
+        assert tab.page.get_by_test_id("card-s0").locator("img").count() == 2
+        assert tab.page.get_by_test_id("specimens-summary").inner_text() == "2 specimens, 2 included"
         assert tab.complaints == []

@@ -10,13 +10,17 @@ from shapespace.errors import ModelFileError, ShapespaceError
 from shapespace.formats.model_parts import LinearModel, ModelFormat, Modes
 from shapespace.formats.registry import MODEL_FORMATS, READ_ONLY_MODELS, read_linear
 from shapespace.model.additive import AdditiveModel
+from shapespace.model.build_model import BuildConfig, build_model
 from shapespace.model.shape_model import ShapeModel
 from synthetic_shapes import blob_model
+from two_parts import VERTICES, two_part_surfaces
 
 ONLY_SHAPE = {"shapeworks"}
 """Formats that hold no expressions apart."""
 WRITTEN = list(MODEL_FORMATS.values())
 PARTED = [one for one in WRITTEN if one.name not in ONLY_SHAPE]
+WITHOUT_PARTS = {"eos"}
+TWO_PARTS = {"upper bone": VERTICES, "lower bone": VERTICES}
 SINGLE = 2e-6
 FLIPS = {"statismo": 5}
 """Damaged files that are tried where it is fewer than `MOST_FLIPS`: of a format that is read in a process apart."""
@@ -58,6 +62,19 @@ def test_a_round_trip_keeps_mean_span_and_variances(one: ModelFormat, model: Sha
     assert covariance_gap(model, again) < 2e-5
     assert np.array_equal(np.asarray(again.faces), np.asarray(model.faces))
     assert again.n_modes == model.n_modes
+
+
+@pytest.mark.parametrize("one", WRITTEN, ids=name)
+def test_parts_of_a_subject_come_back_or_are_named_as_omitted(one: ModelFormat, tmp_path: Path) -> None:
+    model, parts = build_model(two_part_surfaces(5, seed=1), BuildConfig(parts=TWO_PARTS)), tuple(TWO_PARTS)
+    path = tmp_path / f"model{one.suffixes[0] if one.suffixes else ''}"
+    notes = one.write(model.as_linear(), path)
+    again = ShapeModel.load(path)
+    if one.name in WITHOUT_PARTS:
+        assert not again.parts and any(", ".join(parts) in note and "omitted" in note for note in notes)
+    else:
+        assert again.part_counts == TWO_PARTS and again.regions.keys() == TWO_PARTS.keys()
+    assert np.array_equal(np.asarray(again.faces), np.asarray(model.faces))
 
 
 @pytest.mark.parametrize("one", PARTED, ids=name)

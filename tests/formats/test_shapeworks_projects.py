@@ -191,6 +191,7 @@ def test_domains_vary_together(tmp_path: Path) -> None:
         row["world_particles_left"] = row["world_particles_1"]
     found = read_shapeworks(swproj(tmp_path, rows))
     assert len(found.mean) == 2 * PARTICLES and any("2 domains" in note for note in found.notes)
+    assert found.parts == {"1": PARTICLES, "left": PARTICLES}
 
 
 def test_a_mesh_that_lies_elsewhere_is_not_taken_for_the_surface(tmp_path: Path) -> None:

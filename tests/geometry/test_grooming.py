@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from shapespace.errors import InputError, MeshError
 from shapespace.geometry.doctor import examine
-from shapespace.geometry.grooming import Crop, Grooming, closed_borders, fill_holes
+from shapespace.geometry.grooming import Crop, Grooming, closed_borders, counts_of_pieces, fill_holes
 from shapespace.geometry.normals import enclosed_volume, face_areas, faces_of
 from shapespace.geometry.remesh import is_sheet
 from shapespace.types import FloatArray, Mesh
@@ -173,3 +173,13 @@ def test_a_point_cloud_can_be_cropped_but_has_no_pieces() -> None:
     for grooming in (Grooming(largest=True), Grooming(fill_holes=9), Grooming(outer=True)):
         with pytest.raises(MeshError, match=r"cloud\.ply has no faces"):
             grooming.apply(cloud)
+
+
+def test_pieces_of_a_surface_are_named_in_the_order_of_their_vertices() -> None:
+    faces = np.array([[0, 1, 2], [1, 2, 3], [4, 5, 6]], dtype=np.int32)
+    assert counts_of_pieces(faces, 7, ["femur", "tibia"]) == {"femur": 4, "tibia": 3}
+    for names in (["femur"], ["femur", "femur"], ["femur", "tibia", "patella"]):
+        with pytest.raises(InputError, match=r"2 separate pieces, .* in runs of 4, 3"):
+            counts_of_pieces(faces, 7, names)
+    with pytest.raises(InputError, match="in runs of 3, 3, 1"):
+        counts_of_pieces(np.array([[0, 1, 2], [3, 4, 5], [2, 1, 6]], dtype=np.int32), 7, ["femur", "tibia"])

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 import shapespace as ss
 from shapespace.errors import InputError
 from shapespace.geometry.similarity import fit_similarity
+from shapespace.model.model_quality import QualityConfig, measure_quality
 from shapespace.types import Mesh
 
 COUNTS = {"upper": 80, "lower": 60}
@@ -129,3 +130,23 @@ def test_parts_that_are_no_regions_are_refused() -> None:
     fields = {**model.fields(), "parts": ("upper", "foot")}
     with pytest.raises(InputError, match="upper, foot"):
         ss.ShapeModel(**fields)
+
+
+def test_quality_of_parts_is_measured_on_shapes_whose_parts_turn_exactly() -> None:
+    subjects, options = make_subjects(8, seed=5, degrees=80.0), {"folds": 2, "samples": 2, "modes": 3}
+    exact = measure_quality(subjects, QualityConfig(representation="articulated", parts=COUNTS, **options))
+    linear = measure_quality(subjects, QualityConfig(**options))
+    errors = [quality.generalisation_vertices.mean[-1] for quality in (exact, linear)]
+    assert errors[0] < 0.5 * errors[1]
+    # The flexion is one mode of exact shapes, and several of vertices.
+    assert exact.compactness.mean[1] > linear.compactness.mean[1]
+    assert (exact.compactness.low <= exact.compactness.mean).all()
+    with pytest.raises(InputError, match="of several parts"):
+        QualityConfig(representation="articulated")
+
+
+@pytest.mark.parametrize("gauge", ["form", "shape"])
+def test_a_model_of_parts_reconstructs_its_subjects_however_far_they_are_flexed(gauge) -> None:
+    subjects = make_subjects(6, seed=5, degrees=80.0)
+    found = measure_quality(build(subjects, gauge=gauge), unseen=subjects).reconstruction_vertices
+    assert found is not None and found.mean[-1] < 1e-3 < found.mean[0]

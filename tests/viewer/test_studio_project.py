@@ -1,5 +1,6 @@
 """The project of the studio: what its edits do, what undo takes back, and what is refused."""
 
+import csv
 import filecmp
 import json
 import shutil
@@ -347,6 +348,67 @@ def test_a_cell_that_another_tab_changed_while_it_was_typed_is_not_overwritten(w
     assert weighed.state.specimens[1].cells["sex"] == "m"
 
 
+PARTS = ("femur", "tibia")
+
+
+def knees_project(folder: Path) -> Project:
+    """Return a project of three knees, the last without a tibia, whose rows are joined."""
+    made = Project.open(folder, create=True)
+    for k, name in enumerate(("s1_femur", "s1_tibia", "s2_femur", "s2_tibia", "s3_femur")):
+        made.add(tetrahedron(made.new_file(f"{name}.ply"), 1.0 + k), "training")
+    edit(made, what="parts", ids=ids(made), parts=["femur ", "tibia"])
+    return made
+
+
+def test_scans_of_parts_are_one_row_of_the_table_and_one_specimen_of_the_commands(tmp_path: Path) -> None:
+    project = knees_project(tmp_path / "knees")
+    assert ids(project) == ["s1", "s1_tibia", "s2", "s2_tibia", "s3"] and project.state.parts == PARTS
+    join_table(project, b"id,sex\ns1,f\ns2,m\ns3,f\n")
+    edit(project, what="rename", id="s2", to="bert")
+    texts, _ = project.scan_list(project.folder / "inputs" / "0001.csv", project.state.chosen("training"))
+    [rows] = [list(csv.DictReader(text.splitlines())) for text in texts.values()]
+    listed = sorted(" ".join((row["id"], row["part"], row["sex"])) for row in rows)
+    assert listed == ["bert femur m", "bert tibia m", "s1 femur f", "s1 tibia f", "s3 femur f"]
+    assert project.table(project.state.chosen("training")).split() == ["specimen,sex", "bert,m", "s1,f", "s3,f"]
+    assert project.state.counts() == {"sex": {"f": 2, "m": 1}}
+    fits, _ = project.scan_list(project.folder / "inputs" / "0002.csv", project.state.chosen("training"), frozenset())
+    assert all("part" not in text.splitlines()[0] for text in fits.values())
+    edit(project, what="include", ids=["bert"], included=False)
+    assert [one.id for one in project.state.chosen("training")] == ["s1", "s3", "s1_tibia"]
+    edit(project, what="remove", ids=["s1"])
+    assert ids(project) == ["bert", "s2_tibia", "s3"]
+    assert Project.open(project.folder).state == project.state
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [(["femur"], "two or more parts"), (["femur", "patella"], "s1_tibia ends in none"), ([], "two or more parts")],
+)
+def test_scans_that_are_of_no_part_are_not_joined(tmp_path: Path, parts: list[str], message: str) -> None:
+    project = knees_project(tmp_path / "knees")
+    project.undo(project.revision)
+    with pytest.raises(InputError, match=message):
+        edit(project, what="parts", ids=ids(project), parts=parts)
+    project.add(tetrahedron(project.new_file("s1.ply"), 9.0), "training")
+    with pytest.raises(InputError, match="There is a specimen s1 already"):
+        edit(project, what="parts", ids=["s1_femur", "s1_tibia"], parts=PARTS)
+
+
+def test_a_study_of_parts_gives_the_parts_to_the_correspondence_and_one_surface_per_specimen_to_the_model(
+    tmp_path: Path,
+) -> None:
+    done = Done(knees_project(tmp_path / "knees"))
+    done.run("correspond")
+    assert "--parts femur tibia" in " ".join(done.jobs[0].arguments)
+    done.run("build")
+    assert done.jobs[1].arguments[1] == "correspondence-1"
+    done.run("compare", {"--formula": "~ sex"})
+    assert (done.project.folder / "inputs" / "0003.csv").read_text().split() == ["specimen", "s1", "s2", "s3"]
+    assert not done.outdated
+    tetrahedron(done.project.folder / "scans" / "s2_tibia.ply", 20.0)
+    assert done.outdated.keys() >= {1, 2}
+
+
 def test_named_views_that_another_tab_changed_are_not_overwritten(project: Project) -> None:
     views: dict[str, Any] = {"what": "views", "on": "", "views": [DORSAL], "before": []}
     edit(project, **views)
@@ -473,7 +535,7 @@ class Done:
                 options=options or {}, on=made.on, scans=dict(made.scans), status="done")
         )  # fmt: skip
         if kind == "correspond":
-            for name in ids(self.project):
+            for name in [one.id for one in self.project.state.specimens if not one.subject]:
                 tetrahedron(make_folder(self.project.folder / made.output) / f"{name}{CorrespondRecord.SURFACE}", 1.0)
         return number
 

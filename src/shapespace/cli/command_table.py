@@ -511,7 +511,7 @@ COMMANDS: tuple[CommandSpec, ...] = (
             basic("--samples", "N", source=QUALITY, parse=values.positive),
             advanced("--no-align", help="use the meshes in their pose, without alignment", source=QUALITY),
             advanced("--representation", source=QUALITY_TARGETS, field="representations", nargs="+",
-                     choices=_REPRESENTATIONS, default=("vertices",)),
+                     choices=(*_REPRESENTATIONS, "articulated"), default=()),
             _jobs_option("folds"),
         ),
         (
@@ -1074,6 +1074,7 @@ COMMANDS: tuple[CommandSpec, ...] = (
             basic("--unit", "UNIT", "unit of the model, if its format does not contain it (default: mm)",
                   choices=_UNITS),
             advanced("--expressions", "FILE.bin", source=CONVERT),
+            advanced("--parts", "NAME", source=CONVERT, nargs="+"),
         ),
         ("Prints the parts that were kept, changed and omitted. Training shapes are always omitted.",),
     ),

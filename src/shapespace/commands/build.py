@@ -134,7 +134,7 @@ def build(
     """Build a model from mesh files and save it; return it with notes for the user.
 
     Surfaces of fits are read with their records: surfaces of doubtful fits are excluded unless they are requested, and
-    the landmarks of the model of the fits are used.
+    the landmarks and parts of the model of the fits are used.
 
     Raises:
         FileError: a mesh cannot be read, or the model not written.
@@ -164,7 +164,8 @@ def build(
     first = on_disk[0] if streamed else loaded[0]
     if listed.unit_ratios:
         notes.append(listed.unit_note(config.unit))
-    marks = SurfaceLandmarks() if parent is not None else _find_landmarks(files, records, first, config, notes)
+    fitted = _model_of_fits(files, records, first)
+    marks = SurfaceLandmarks() if parent is not None else _find_landmarks(files, fitted, first, config, notes)
     regions = {
         name: region_vertices(read_region(file), len(first.vertices), name) for name, file in config.regions.items()
     }
@@ -176,7 +177,7 @@ def build(
         landmarks=marks,
         provenance=provenance,
         min_seen=MIN_SEEN if config.min_seen is None else config.min_seen,
-        parts=dict(listed.parts) or None,
+        parts=dict(listed.parts) or (None if isinstance(fitted, str) else fitted.part_counts or None),
     )
     config = replace(config, model=chosen)
     additive = None
@@ -260,7 +261,10 @@ def _load_parent(path: Path, output: Path) -> ShapeModel:
         raise InputError(f"{output} is the model that meshes are added to; give another name for the new model.")
     model = ShapeModel.load(path)
     if model.held_out or model.representation != "vertices":
-        reason = "separates identity and expression" if model.held_out else "is of B-spline surfaces"
+        reason = (
+            "separates identity and expression" if model.held_out
+            else "is of B-spline surfaces" if model.is_linear else "is of shapes and relative poses"
+        )  # fmt: skip
         raise InputError(f"{path} {reason}, and meshes can be added only to plain models of vertices; build it again.")
     return model
 
@@ -335,7 +339,7 @@ def _exclude_doubtful(
 
 def _find_landmarks(
     files: Sequence[Path],
-    records: Mapping[Path, FitRecord],
+    fitted: ShapeModel | str,
     first: Mesh,
     config: BuildFilesConfig,
     notes: list[str],
@@ -353,31 +357,32 @@ def _find_landmarks(
             return SurfaceLandmarks()
         notes += [f"Landmarks are taken from {landmark_file}.", *placed]
         return marks
-    return _landmarks_of_parent(files, records, first, notes)
+    if isinstance(fitted, str):
+        notes += [f"The model has no landmarks, since {fitted}."] if fitted else []
+        return SurfaceLandmarks()
+    if fitted.landmarks:
+        notes.append(f"Landmarks are those of {fitted.file}, which fitted these meshes.")
+    return fitted.landmarks
 
 
-def _landmarks_of_parent(
-    files: Sequence[Path], records: Mapping[Path, FitRecord], first: Mesh, notes: list[str]
-) -> SurfaceLandmarks:
-    """Return the landmarks of the one model that fitted all `files`, whose vertices have the order of the model."""
+def _model_of_fits(files: Sequence[Path], records: Mapping[Path, FitRecord], first: Mesh) -> ShapeModel | str:
+    """Return the one model that fitted all `files`, whose vertices have the order of the model.
+
+    Without such a model, return the reason as a clause; it is empty if the files are not surfaces of fits.
+    """
     models = [record.model for record in records.values()]
     if len(records) < len(files) or not all(model.hash for model in models):
-        return SurfaceLandmarks()
+        return ""
     if len({model.hash for model in models}) > 1:
-        notes.append("The model has no landmarks, since the meshes were fitted by different models; give --landmarks.")
-        return SurfaceLandmarks()
+        return "the meshes were fitted by different models; give --landmarks"
     path = files[0].parent / (models[0].path or models[0].name)
     try:
         parent = ShapeModel.load(path)
     except ShapespaceError:
-        notes.append(f"The model has no landmarks, since the model that fitted these meshes is no longer at {path}.")
-        return SurfaceLandmarks()
+        return f"the model that fitted these meshes is no longer at {path}"
     if parent.content_hash != models[0].hash or parent.n_vertices != len(first.vertices):
-        notes.append(f"The model has no landmarks, since {path} is not the model that fitted these meshes.")
-        return SurfaceLandmarks()
-    if parent.landmarks:
-        notes.append(f"Landmarks are those of {path}, which fitted these meshes.")
-    return parent.landmarks
+        return f"{path} is not the model that fitted these meshes"
+    return parent
 
 
 def _read_landmarks(path: Path, first: Mesh, mm: float, notes: list[str]) -> SurfaceLandmarks:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,8 @@ from shapespace.commands.outcome import Outcome
 from shapespace.errors import InputError
 from shapespace.formats.model_parts import ModelFormat
 from shapespace.formats.registry import MODEL_FORMATS, format_to_write
+from shapespace.geometry.articulation import regions_of_parts
+from shapespace.geometry.grooming import counts_of_pieces
 from shapespace.model.additive import AdditiveModel, load_model, model_of_foreign
 from shapespace.model.foreign import OWN_ENDINGS, is_foreign, load_foreign
 from shapespace.model.shape_model import ShapeModel
@@ -26,6 +29,7 @@ def convert(
     to: str | None = None,
     unit: str | None = None,
     expressions: Path | None = None,
+    parts: Sequence[str] = (),
     quiet: bool = False,
 ) -> Outcome:
     """Write the model in `source` to `output`, and note the data that the new format cannot store.
@@ -36,6 +40,8 @@ def convert(
         to: format to write, by its name, if the extension of the output does not determine it.
         unit: unit of `source` if its format does not contain it; None for the unit of the format, or mm.
         expressions: blendshapes that eos keeps in a file of their own.
+        parts: names of the structures of one subject, such as bones, in a model whose file does not name them: the
+            separate pieces of its surface, in the order of their vertices.
         quiet: no progress.
 
     Raises:
@@ -47,8 +53,8 @@ def convert(
         raise InputError(f"{output} is the model itself; give another name to write to.")
     with waiting(f"reading {source.name}", quiet=quiet):
         model, of, notes = _load_model(source, mm, expressions)
+        model, left_out = _model_to_write(model, parts)
         linear = model.as_linear()
-    model, left_out = _without_training_shapes(model)
     notes += left_out
     with waiting(f"writing {output.name}", quiet=quiet):
         if target is None:
@@ -60,7 +66,7 @@ def convert(
         notes.append(
             f"Relative pose is linear in {target.title}: parts that turn by large angles shrink, unlike in the model."
         )
-    regions = sorted(shape.regions)
+    regions = sorted(set(shape.regions) - set(shape.parts))
     if target is not None and regions:
         notes.append(
             f"Omitted: the region{'' if len(regions) == 1 else 's'} {', '.join(regions)}, which {target.title} has no "
@@ -74,16 +80,20 @@ def convert(
     return Outcome(facts, lines)
 
 
-def _without_training_shapes(
-    model: ShapeModel | AdditiveModel,
+def _model_to_write(
+    model: ShapeModel | AdditiveModel, parts: Sequence[str]
 ) -> tuple[ShapeModel | AdditiveModel, list[str]]:
-    """Return the model without its training shapes, which are not shared, and a sentence on that if it had some."""
-    shape = model if isinstance(model, ShapeModel) else model.shape
-    if shape.training is None:
-        return model, []
-    note = f"Omitted: {len(shape.training)} training shapes, so {NOT_CALIBRATED}."
+    """Return the model with named `parts`, if any, and without its training shapes, which are not shared, and a
+    sentence on that if it had some.
+    """
+    shape, notes = model if isinstance(model, ShapeModel) else model.shape, list[str]()
+    if shape.training is not None:
+        notes.append(f"Omitted: {len(shape.training)} training shapes, so {NOT_CALIBRATED}.")
+    if parts:
+        regions = regions_of_parts(counts_of_pieces(shape.faces, shape.n_vertices, parts))
+        shape = replace(shape, regions={**shape.regions, **regions}, parts=tuple(parts))
     shape = replace(shape, training=None)
-    return shape if isinstance(model, ShapeModel) else replace(model, shape=shape), [note]
+    return shape if isinstance(model, ShapeModel) else replace(model, shape=shape), notes
 
 
 def _target_format(output: Path, to: str | None) -> ModelFormat | None:

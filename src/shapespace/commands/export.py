@@ -205,6 +205,10 @@ def export_cohort(cohort: Cohort, output: Path, to: Target, formula: str | None 
         notes += cohort.cautions
     if cohort.estimated_share.any():
         notes.append("Missing landmarks or vertices are written at their estimated positions.")
+    if cohort.parts:
+        notes.append(
+            "Parts are exported as they are compared: those that turn by large angles shrink, unlike surfaces."
+        )
     known = cohort.landmarks.names if cohort.source.kind == "landmarks" and cohort.landmarks is not None else ()
     shapes = np.stack([cohort.vertices(k) for k in range(len(cohort))])[:, :, : cohort.dimensions]
     columns = {"size": numbers_as_text(cohort.sizes_mm), **cohort.table.columns}

@@ -57,8 +57,9 @@ class QualityOptions:
     """Measures of quality, and the data that they refer to.
 
     Args:
-        representations: vertices or control points that the modes change, one choice for all targets or one for each;
-            with two choices, one target is compared with itself.
+        representations: vertices, control points, or shapes and relative poses of several parts (articulated) that the
+            modes change, one choice for all targets or one for each; with two choices, one target is compared with
+            itself (default: articulated for surfaces of several parts, otherwise vertices).
         scans: folder of the scans that the surfaces were made from, with the same names, pose and unit: distances are
             measured to these.
         unseen: folder of corresponding shapes that no model was trained on: also measure the error on these.
@@ -69,7 +70,7 @@ class QualityOptions:
         InputError: representations that do not exist.
     """
 
-    representations: Sequence[str] = ("vertices",)
+    representations: Sequence[str] = ()
     scans: Path | None = None
     unseen: Path | None = None
     with_doubtful: bool = False
@@ -136,9 +137,8 @@ def quality(
             result, others=(parts[1],), differences=differences, sentences=(*result.sentences, *comparison)
         )
     notes += [
-        f"{target.name} is a model file, which does not keep its training shapes: only compactness is computed; "
-        "generalisation and specificity need a folder"
-        + ("." if options.unseen else "; --unseen FOLDER measures it on shapes that it did not see.")
+        f"{target.name} is a model file: only compactness is computed; generalisation and specificity need the folder "
+        "of its meshes" + ("." if options.unseen else "; --unseen FOLDER measures it on shapes that it did not see.")
         for target in loaded
         if isinstance(target.data, ShapeModel)
     ]
@@ -170,12 +170,13 @@ def _load_targets(
     if len(targets) > _MOST_TARGETS or len(names) > _MOST_TARGETS:
         raise InputError("At most two targets or representations are compared; give one or two.")
     gauge = config.gauge if config.align else "form"
-    loaded: list[tuple[ShapeModel | list[Mesh], dict[str, float]]] = [
-        (ShapeModel.load(target[0]), {})
+    loaded: list[tuple[ShapeModel | list[Mesh], dict[str, float], Mapping[str, int]]] = [
+        (ShapeModel.load(target[0]), {}, {})
         if not target[0].is_dir() and looks_like_model(target[0])
         else _read_meshes(target, notes, gauge, options, quiet=quiet)
         for target in targets
     ]
+    names = names or ["articulated" if parts else "vertices" for _, _, parts in loaded]
     pairs = [(k, names[min(k, len(names) - 1)]) for k in range(len(targets))]
     if len(targets) == 1 and len(names) == _MOST_TARGETS:
         pairs = [(0, name) for name in names]
@@ -183,16 +184,23 @@ def _load_targets(
     out: list[_QualityInput] = []
     for k, name in pairs:
         called = f"{_name(targets[k])}, {name}" if several else _name(targets[k])
-        out.append(_QualityInput(called, loaded[k][0], _config_of_representation(config, name, names), loaded[k][1]))
+        data, unit_ratios, parts = loaded[k]
+        out.append(_QualityInput(called, data, _config_of_representation(config, name, names, parts), unit_ratios))
     if len(out) == _MOST_TARGETS and not any(isinstance(target.data, ShapeModel) for target in out):
         _check_same_shapes(out)
     return out
 
 
-def _config_of_representation(config: QualityConfig, name: str, names: Sequence[str]) -> QualityConfig:
+def _config_of_representation(
+    config: QualityConfig, name: str, names: Sequence[str], parts: Mapping[str, int]
+) -> QualityConfig:
     """Return the configuration of one representation; `vertices`, compared with B-splines, has no control points."""
-    splines = name != "vertices" or set(names) == {"vertices"}
-    return replace(config, representation=name, control_points=config.control_points if splines else None)
+    return replace(
+        config,
+        representation=name,
+        control_points=config.control_points if name != "vertices" or set(names) == {"vertices"} else None,
+        parts=dict(parts) if name == "articulated" else None,
+    )
 
 
 def _check_same_shapes(targets: Sequence[_QualityInput]) -> None:
@@ -212,8 +220,8 @@ def _name(target: Sequence[Path]) -> str:
 
 def _read_meshes(
     target: Sequence[Path], notes: list[str], gauge: Gauge, options: QualityOptions, *, quiet: bool
-) -> tuple[list[Mesh], dict[str, float]]:
-    """Return the meshes of a target in the unit of most meshes, and the unit ratios of the others."""
+) -> tuple[list[Mesh], dict[str, float], Mapping[str, int]]:
+    """Return the meshes of a target in the unit of most meshes, the unit ratios of the others, and their parts."""
     listed, review = reviewed_surfaces(target, "--with-doubtful", with_doubtful=options.with_doubtful)
     if summary := review_summary(review):
         notes.append(f"{_name(target)}: {summary}.")
@@ -231,7 +239,7 @@ def _read_meshes(
             files = surfaces
             break
     meshes = SurfacesOnDisk(files, listed).read(quiet=quiet)
-    return meshes, {surface_stem(file): ratio for file, ratio in listed.unit_ratios.items()}
+    return meshes, {surface_stem(file): ratio for file, ratio in listed.unit_ratios.items()}, listed.parts
 
 
 def _read_scans(target: _QualityInput, folder: Path | None, *, quiet: bool) -> list[Mesh] | None:

@@ -74,6 +74,8 @@ def write_eos(model: LinearModel, path: Path) -> Sequence[str]:
     notes = ["Numbers are in single precision.", *_moved_landmarks(model)]
     if model.provenance or model.licence:
         notes.append("Provenance and licence are omitted, since eos has no field for them.")
+    if model.parts:
+        notes.append(f"The parts {', '.join(model.parts)} are omitted, since eos has no field for them.")
     return notes
 
 

@@ -71,6 +71,8 @@ class LinearModel:
         mm: length of the unit of the file, mm; None if the format does not state it, which is interpreted as 1 mm.
         landmarks: named points on the surface, or a mapping of name to vertex for landmarks at vertices.
         n_training: number of training shapes; None if the file does not state it.
+        parts: number of vertices of each structure of one subject by its name, in the order of the vertices; empty if
+            there is one structure.
         held_out: whether the variances are valid for new shapes without correction, such as those of a Gaussian
             process; False for variances of the training shapes.
         provenance: description of the origin of the model.
@@ -85,6 +87,7 @@ class LinearModel:
     mm: float | None = None
     landmarks: SurfaceLandmarks = field(default_factory=SurfaceLandmarks)
     n_training: int | None = None
+    parts: Mapping[str, int] = field(default_factory=dict[str, int])
     held_out: bool = False
     provenance: str = ""
     licence: str = ""
@@ -204,6 +207,7 @@ def facts_of(model: LinearModel) -> dict[str, Any]:
         "total_variance_mm2": None if total is None else float(total * mm**2),
         "landmarks": dict(model.landmarks),
         **({} if model.landmarks.are_vertices else {_PLACES: _places_of(model.landmarks, mm)}),
+        **({"parts": dict(model.parts)} if model.parts else {}),
         "provenance": model.provenance,
         "licence": model.licence,
     }
@@ -242,11 +246,18 @@ def with_facts(model: LinearModel, facts: object) -> LinearModel:
         expression=expression,
         landmarks=landmarks,
         n_training=training if training is not None and training > 1 else model.n_training,
+        parts=parts_of(known.get("parts"), n) or model.parts,
         held_out=known.get("held_out") is True,
         provenance=_words(known.get("provenance")) or model.provenance,
         licence=_words(known.get("licence")) or model.licence,
         notes=notes,
     )
+
+
+def parts_of(value: object, n: int) -> dict[str, int]:
+    """Return the numbers of vertices of the parts in a JSON object; none if they are not those of `n` vertices."""
+    parts = {str(name): count for name, own in json_object(value).items() if (count := _count(own))}
+    return parts if sum(parts.values()) == n else {}
 
 
 def _places_of(landmarks: SurfaceLandmarks, mm: float) -> dict[str, dict[str, Any]]:

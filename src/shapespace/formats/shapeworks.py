@@ -21,6 +21,8 @@ from scipy.spatial import KDTree
 
 from shapespace.errors import InputError, ModelFileError, ShapespaceError
 from shapespace.formats.model_parts import KEY, LinearModel, Modes, facts_of, json_object, with_facts, write_folder
+from shapespace.geometry.articulation import regions_of_parts
+from shapespace.geometry.normals import part_of
 from shapespace.geometry.procrustes import align_in_place
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.containers.json_files import check_file, parse_json
@@ -85,19 +87,23 @@ def write_shapeworks(model: LinearModel, path: Path) -> Sequence[str]:
     count = displacements.shape[1] + 1
     z = np.asarray(dct(np.eye(count), norm="ortho", axis=0), dtype=np.float64)[1:] * np.sqrt(count - 1)
     folder = path.with_name(f"{path.stem}_particles")
+    domains = regions_of_parts(model.parts or {"1": len(mean)})
     files: dict[str, bytes] = {}
     rows: list[dict[str, str]] = []
     for number in range(count):
         vertices = mean + (displacements @ z[:, number]).reshape(-1, 3)
-        name = f"shape_{number:03d}"
-        particles, surface = f"{name}.particles", f"{name}.vtk"
-        files[particles] = number_lines(vertices, "%.17g %.17g %.17g").encode()
-        row = {"name": name}
-        if model.faces is not None:
-            files[surface] = write_vtk(Mesh(vertices, model.faces))
-            row |= {f"{key}_1": f"{folder.name}/{surface}" for key in ("shape", "groomed")}
-        row |= {f"{key}_particles_1": f"{folder.name}/{particles}" for key in ("local", "world")}
-        rows.append({**row, "alignment_1": _IDENTITY, "procrustes_1": _IDENTITY})
+        row = {"name": f"shape_{number:03d}"}
+        for k, (domain, region) in enumerate(domains.items(), 1):
+            name = f"{row['name']}_{k}" if model.parts else row["name"]
+            particles, surface = f"{name}.particles", f"{name}.vtk"
+            files[particles] = number_lines(vertices[region], "%.17g %.17g %.17g").encode()
+            if model.faces is not None:
+                inside = np.isin(np.arange(len(mean)), region)
+                files[surface] = write_vtk(part_of(Mesh(vertices, model.faces), inside))
+                row |= {f"{key}_{domain}": f"{folder.name}/{surface}" for key in ("shape", "groomed")}
+            row |= {f"{key}_particles_{domain}": f"{folder.name}/{particles}" for key in ("local", "world")}
+            row |= {f"alignment_{domain}": _IDENTITY, f"procrustes_{domain}": _IDENTITY}
+        rows.append(row)
     write_folder(folder, files)
     tree = {"data": rows, "optimize": {"number_of_particles": str(len(mean))}, KEY: facts_of(model)}
     write_text(path, json.dumps(tree, indent=1) + "\n")
@@ -166,7 +172,7 @@ def _model(project: _Project) -> LinearModel:
     if len(rows) < len(project.rows):
         notes.append(f"{len(project.rows) - len(rows)} subjects without particles are omitted.")
     if len(domains) > 1:
-        notes.append(f"Its {len(domains)} domains vary together in one model.")
+        notes.append(f"Its {len(domains)} domains vary together in one model, as its parts {', '.join(domains)}.")
     if kind == "local":
         align_in_place(shapes, "form")
         notes.append("It has local particles only, which were aligned rigidly.")
@@ -187,7 +193,7 @@ def _model(project: _Project) -> LinearModel:
         notes.append(f"It is a point model of {len(points)} particles: {carried}.")
     else:
         points, displacements = carried
-        faces = surface.faces
+        faces, counts = surface.faces, [len(mesh) for _, mesh in surface.carry]
         notes.append(
             f"Its surface is the mesh of {surface.subject}, the most average subject, carried by the particles with "
             "biharmonic splines."
@@ -197,7 +203,8 @@ def _model(project: _Project) -> LinearModel:
         shape=Modes(displacements),
         faces=faces,
         n_training=len(rows),
-        provenance=f"ShapeWorks project {project.path.name}: {len(rows)} subjects, {sum(counts)} particles",
+        parts=dict(zip(domains, counts, strict=True)) if len(domains) > 1 else {},
+        provenance=f"ShapeWorks project {project.path.name}: {len(rows)} subjects, {flat.shape[1] // 3} particles",
         notes=tuple(notes),
     )
 

@@ -8,6 +8,7 @@ scalismo-faces) consists of three such models: shape, colour, expression. Models
 from __future__ import annotations
 
 import io
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -25,6 +26,7 @@ from shapespace.formats.model_parts import (
     are_measurable,
     are_triangles,
     orthonormal,
+    parts_of,
     scale_columns,
 )
 from shapespace.geometry.landmark_placement import place_landmarks
@@ -136,6 +138,7 @@ def _model(tree: FileContent, path: Path) -> LinearModel:
         # False for Gaussian processes: fits with their uncorrected variances were overconfident.
         held_out=parameters.get("held_out") == "yes",
         provenance=parameters.get("provenance") or " ".join(f"statismo model {representer}".split()),
+        parts=parts_of(json.loads(parameters.get("parts") or "{}"), len(mean) // 3),
         licence=parameters.get("licence") or (_BFM_LICENCE if is_bfm else ""),
         notes=tuple(notes),
     )
@@ -399,6 +402,7 @@ def tree_of(model: LinearModel) -> tuple[FileContent, list[str]]:
         "held_out": "yes" if model.held_out else "no",
     }
     provenance |= {"unit": "mm"} if model.mm == 1.0 else {}
+    provenance |= {"parts": json.dumps(dict(model.parts))} if model.parts else {}
     provenance |= {"n_training": str(model.n_training)} if model.n_training else {}
     provenance = {name: text.replace("\0", " ") for name, text in provenance.items() if text}
     growing = _TreeBuilder(model, provenance, datetime.now(UTC).strftime("%a %b %d %H:%M:%S UTC %Y"))

@@ -9,7 +9,7 @@ MMBIA 2007), measured at the joints. Equation numbers are those of docs/structur
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -276,6 +276,12 @@ class Articulation:
 
 def _inverse_inertia(x: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.inv((x**2).sum() * np.eye(3) - x.T @ x), dtype=np.float64)
+
+
+def regions_of_parts(counts: Mapping[str, int]) -> dict[str, IntArray]:
+    """Return the vertices (n,) of each part by its name, from the numbers of vertices, which follow one another."""
+    bounds = pairwise(np.cumsum([0, *counts.values()]).tolist())
+    return {name: np.arange(*ends, dtype=np.int32) for name, ends in zip(counts, bounds, strict=True)}
 
 
 def size_of_parts(vertices: FloatArray, counts: Sequence[int]) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +18,7 @@ CROPS = {"sphere": 4, "outside": 4, "box": 6, "plane": 6, "landmarks": 1}
 """Number of values that each kind of crop needs."""
 MOST_EDGES = 500
 """Largest number of border edges of a hole that is filled: the time grows with its cube, and is 1.5 s for 500."""
+_LISTED = 12  # runs of vertices in a message
 _LEAST_AREA = 1e-6
 """Twice the area of a triangle over its longest edge squared, below which none is made: it would count as a line."""
 _SHORT_EDGES = 1e-3
@@ -177,6 +179,28 @@ def pieces_of(faces: IntArray, vertices: int) -> tuple[int, IntArray]:
     flat = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
     graph = coo_array((np.ones(len(flat)), (flat[:, 0], flat[:, 1])), shape=(vertices, vertices))
     return connected_components(graph, directed=False)
+
+
+def counts_of_pieces(faces: IntArray | None, n_vertices: int, names: Sequence[str]) -> dict[str, int]:
+    """Return the number of vertices of each separate piece of a surface by its name, in the order of the vertices.
+
+    Args:
+        faces: (F, 3) triangles; None for points.
+        n_vertices: number of all vertices.
+        names: names of the pieces, in order.
+
+    Raises:
+        InputError: the surface has another number of pieces, or the vertices of a piece do not follow one another.
+    """
+    pieces, piece = pieces_of(np.zeros((0, 3), dtype=np.int32) if faces is None else faces, n_vertices)
+    starts = np.flatnonzero(np.diff(piece, prepend=-1))
+    counts = np.diff(starts, append=n_vertices).tolist()
+    if not pieces == len(starts) == len(set(names)) == len(names):
+        raise InputError(
+            f"{len(names)} parts are named ({', '.join(names)}), and the surface has {pieces} separate pieces, whose "
+            f"vertices follow one another in runs of {', '.join(map(str, counts[:_LISTED]))}; give each piece a name."
+        )
+    return dict(zip(names, counts, strict=True))
 
 
 def _largest_piece(mesh: Mesh) -> tuple[Mesh, int, float]:

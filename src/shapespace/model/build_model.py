@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeAlias, get_args
 import numpy as np
 
 from shapespace.errors import InputError
-from shapespace.geometry.articulation import Articulation, articulate
+from shapespace.geometry.articulation import Articulation, articulate, regions_of_parts
 from shapespace.geometry.bspline import SplineSquare
 from shapespace.geometry.flatten import disc_map
 from shapespace.geometry.mirror_plane import mirrored_note
@@ -359,16 +359,14 @@ def _regions_of_parts(parts: Mapping[str, int], meshes: Sequence[Mesh]) -> dict[
     Raises:
         InputError: the numbers of vertices are not those of the meshes.
     """
-    ends = np.cumsum([0, *parts.values()])
-    if parts and meshes and (min(parts.values()) < 1 or ends[-1] != len(meshes[0].vertices)):
+    n_vertices = sum(parts.values())
+    if parts and meshes and (min(parts.values()) < 1 or n_vertices != len(meshes[0].vertices)):
         counts = ", ".join(f"{name} {count}" for name, count in parts.items())
         raise InputError(
-            f"The parts have {ends[-1]} vertices ({counts}), but {meshes[0].name} has {len(meshes[0].vertices)}; give "
-            "the number of vertices of each part, in the order of the vertices."
+            f"The parts have {n_vertices} vertices ({counts}), but {meshes[0].name} has {len(meshes[0].vertices)}; "
+            "give the number of vertices of each part, in the order of the vertices."
         )
-    return {
-        name: np.arange(start, end, dtype=np.int32) for name, start, end in zip(parts, ends, ends[1:], strict=False)
-    }
+    return regions_of_parts(parts)
 
 
 def _shapes_of_parts(

@@ -9,6 +9,7 @@ import numpy as np
 
 from shapespace.errors import ModelFileError
 from shapespace.formats.model_parts import ORTHOGONAL, LinearModel, Modes, orthonormal
+from shapespace.geometry.articulation import regions_of_parts
 from shapespace.io.containers.hdf5 import is_ours
 from shapespace.model.model_file import ModelFields
 from shapespace.types import FloatArray
@@ -103,8 +104,8 @@ def load_foreign(path: Path, mm: float | None = None, expressions: Path | None =
         "licence": linear.licence,
         "held_out": linear.held_out,
         "residuals": None,
-        "regions": {},
-        "parts": (),
+        "regions": regions_of_parts(linear.parts),
+        "parts": tuple(linear.parts),
         "is_n_training_known": linear.n_training is not None,
         "training": None,
         "dropped_vertices": np.zeros(0, dtype=np.int32),
@@ -141,6 +142,7 @@ def as_linear(fields: ModelFields, mean: FloatArray, directions: FloatArray) -> 
         mm=1.0,
         landmarks=fields["landmarks"],
         n_training=fields["n_training"],
+        parts={name: len(fields["regions"][name]) for name in fields["parts"]},
         held_out=fields["held_out"],
         provenance=fields["provenance"],
         licence=fields["licence"],

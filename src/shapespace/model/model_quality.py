@@ -12,8 +12,8 @@ the error of a model if every correspondence is known: the lower bound for every
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -27,10 +27,11 @@ from shapespace.geometry.procrustes import Gauge
 from shapespace.geometry.similarity import fit_similarity
 from shapespace.io.interop import MeshLike, as_meshes
 from shapespace.lazy import lazy_import
+from shapespace.model.build_model import BuildConfig, build_model
 from shapespace.model.choose_modes import FEWEST_SHAPES
 from shapespace.model.missing import MIN_SEEN, ObservedMeshes
 from shapespace.model.pca import Modes
-from shapespace.model.representation import representation_named
+from shapespace.model.representation import REPRESENTATIONS
 from shapespace.model.shape_model import ShapeModel
 from shapespace.reprs import short_repr
 from shapespace.step_counter import StepCounter
@@ -207,11 +208,13 @@ class QualityConfig:
         seed: seed of folds and random shapes.
         gauge: `form` keeps size, `shape` removes size.
         align: whether to align the shapes.
-        representation: representation of the shapes, see `ShapeModel.fit`.
+        representation: representation of the shapes, see `BuildConfig`, or `articulated`: several parts with modelled
+            relative pose.
         control_points: control points of a B-spline along each side, 4 to 64 (default 24x24).
+        parts: number of vertices of each part by its name, in order; only for the representation `articulated`.
 
     Raises:
-        InputError: a number has an impossible value.
+        InputError: a number has an impossible value, or `articulated` shapes have no parts.
     """
 
     folds: int | None = 10
@@ -222,9 +225,15 @@ class QualityConfig:
     align: bool = True
     representation: str = "vertices"
     control_points: tuple[int, int] | None = None
+    parts: Mapping[str, int] | None = None
 
     def __post_init__(self) -> None:
         require_whole(self.folds, "folds")
+        if (self.representation == "articulated") != bool(self.parts):
+            raise InputError(
+                "The representation articulated is that of surfaces of several parts, as correspond --parts writes "
+                "them; give such surfaces, or another representation."
+            )
         if self.folds is not None and self.folds < 2:
             raise InputError(f"Shapes are held out in at least two folds, not in {self.folds}.")
         if self.samples < 2 or (self.modes is not None and self.modes < 1):
@@ -232,10 +241,11 @@ class QualityConfig:
 
     def space(self, meshes: Sequence[Mesh], modes: Modes = "all") -> ShapeModel:
         """Return the shape model of `meshes`, with the vertices that at least two of the meshes show."""
-        return ShapeModel.fit(
-            meshes, modes=modes, gauge=self.gauge, align=self.align, representation=self.representation,
+        representation = "vertices" if self.parts else self.representation
+        return build_model(meshes, BuildConfig(
+            modes=modes, gauge=self.gauge, align=self.align, representation=representation, parts=self.parts,
             control_points=self.control_points, min_seen=_ANY, seed=self.seed,
-        )  # fmt: skip
+        ))  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -462,10 +472,13 @@ def measure_quality(
         _check_vertex_count(mesh, vertices)
     if isinstance(target, ShapeModel):
         return _measure_model(target, new, config, progress)
-    takes_holes = representation_named(config.representation, config.control_points).takes_holes
+    takes_holes = REPRESENTATIONS[config.representation].takes_holes
     included = np.ones(vertices, dtype=np.bool_) if takes_holes else ObservedMeshes.of(meshes, MIN_SEEN).vertices
     if not included.all():
         meshes, new = [part_of(mesh, included) for mesh in meshes], [part_of(mesh, included) for mesh in new]
+        if config.parts:
+            masks = zip(config.parts, np.split(included, np.cumsum(list(config.parts.values()))[:-1]), strict=True)
+            config = replace(config, parts={name: int(mask.sum()) for name, mask in masks})
     shapes = Shapes(meshes, scans, config)
     return _measure_meshes(shapes, new, progress, run, left_out=int((~included).sum()))
 
@@ -501,7 +514,7 @@ def _measure_meshes(
     of_unseen = _measure_unseen(space, unseen, counts, config, steps)
     there = np.mean([len(target.seen) for target in shapes.targets]) / len(meshes[0].vertices)
     return ModelQuality(
-        _compactness(space, shapes.trained, counts, config),
+        _compactness(space, counts, len(meshes)),
         generalisation=general[0],
         generalisation_vertices=general[1],
         specificity=specific[0],
@@ -594,8 +607,12 @@ def _errors_by_modes(model: ShapeModel, target: _Target, counts: IntArray, *, su
 
 
 def _onto_mean(model: ShapeModel, target: _Target) -> Similarity:
-    seen, scaled = target.seen, model.gauge == "shape"
-    return fit_similarity(target.shape.vertices[seen], model.mean_vertices[seen], with_scale=scaled)
+    """Return T_model_target, the pose of the target in the frame of the model."""
+    if not model.is_linear:
+        # The mean shape in another relative pose determines neither pose nor size.
+        return _in_best_pose(model, target, model.n_modes, Similarity.identity())[1]
+    there, mean = target.shape.vertices[target.seen], model.mean_vertices[target.seen]
+    return fit_similarity(there, mean, with_scale=model.gauge == "shape")
 
 
 def _in_best_pose(model: ShapeModel, target: _Target, k: int, T: Similarity) -> tuple[FloatArray, Similarity]:
@@ -605,6 +622,10 @@ def _in_best_pose(model: ShapeModel, target: _Target, k: int, T: Similarity) -> 
     """
     shape, seen, total = target.shape.vertices, target.seen, model.total_variance
     left = max(total - float((model.stddev[:k] ** 2).sum()), _LEAST_NOISE * total)
+    if not model.is_linear:
+        noise, scaled = left / shape.size if len(seen) < len(shape) else 0.0, model.gauge == "shape"
+        b, T = model.nearest_in_any_pose(shape, with_scale=scaled, noise=noise, stddev=model.stddev[:k])
+        return model.reconstruct(b), T.inverse()
     reconstructed = model.mean_vertices
     for _ in range(_POSE_ROUNDS):
         reconstructed = model.reconstruct(model.nearest(T.apply(shape), k, left / shape.size))
@@ -661,20 +682,21 @@ def _pose_shapes(model: ShapeModel, targets: Sequence[_Target], config: QualityC
     return [target.shape.with_vertices(_onto_mean(model, target).apply(target.shape.vertices)) for target in targets]
 
 
-def _compactness(model: ShapeModel, targets: Sequence[_Target], counts: IntArray, config: QualityConfig) -> Curve:
-    """Return the share of the variance of the first modes, with an interval by jackknife over shapes."""
-    posed = [mesh.vertices for mesh in _pose_shapes(model, targets, config)]
-    for i, target in enumerate(targets):
-        if len(target.seen) < model.n_vertices:
-            reconstructed = _in_best_pose(model, target, model.n_modes, _onto_mean(model, target))[0]
-            posed[i] = np.where(np.isnan(posed[i]), reconstructed, posed[i])
-    flat = np.stack(posed).reshape(len(targets), -1) - model.mean_vertices.reshape(-1)
-    gram = flat @ flat.T
+def _compactness(model: ShapeModel, counts: IntArray, shapes: int) -> Curve:
+    """Return the share of the variance of the first modes, with an interval by jackknife over the training shapes.
+
+    Args:
+        model: a model with its training shapes.
+        counts: (n,) numbers of modes.
+        shapes: number of all training shapes; of many shapes the model keeps a sample.
+    """
+    assert model.training is not None
+    gram = model.training.coefficients @ model.training.coefficients.T
     share = model.cumulative_variance[np.minimum(counts, model.n_modes) - 1]
-    n, count = len(targets), min(model.vertex_basis.shape[1], model.n_modes)
+    n, count = len(gram), min(model.vertex_basis.shape[1], model.n_modes)
     rest = [np.flatnonzero(np.arange(n) != i) for i in range(n)]
     without = np.stack([_variance_shares(gram[np.ix_(some, some)], counts, count) for some in rest])
-    spread = 1.96 * np.sqrt((n - 1) / n * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
+    spread = 1.96 * np.sqrt((n - 1) / shapes * ((without - without.mean(axis=0)) ** 2).sum(axis=0))
     return Curve(counts, share, np.maximum(share - spread, 0.0), np.minimum(share + spread, 1.0))
 
 

@@ -17,7 +17,6 @@ from shapespace.errors import InputError
 from shapespace.geometry.articulation import Articulation, PartPoses
 from shapespace.geometry.normals import without_vertices
 from shapespace.io.memory_cache import cached_with_owner
-from shapespace.model.representation import Articulated
 from shapespace.model.shape_model import ShapeModel, region_vertices
 from shapespace.types import BoolArray, FloatArray
 
@@ -220,9 +219,7 @@ class RelativePose:
 
 def articulation_of(model: ShapeModel) -> Articulation:
     """Return the joints of a model of several parts: its own, or else those of its mean shape."""
-    if not model.is_linear:
-        return Articulated.from_arrays(model.coding).parts
-    return Articulation(model.mean_vertices, list(model.part_counts.values()))
+    return model.articulation or Articulation(model.mean_vertices, list(model.part_counts.values()))
 
 
 def relative_pose(model: ShapeModel) -> RelativePose | None:

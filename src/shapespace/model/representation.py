@@ -249,22 +249,21 @@ class DetailedBSplineSurface(BSplineSurface):
     _keeps_detail: ClassVar[bool] = True
 
 
-class Articulated:
+class Articulated(Vertices):
     """Tangent vertices of several parts: shapes of the parts and their relative poses, D = 3V (S1-S7).
 
     Args:
         parts: the parts in their mean shapes and relative poses.
     """
 
-    takes_holes: ClassVar[bool] = False
     is_linear: ClassVar[bool] = False
 
     def __init__(self, parts: Articulation) -> None:
         self.parts = parts
 
     @classmethod
-    def check(cls, control_points: tuple[int, int] | None) -> None:
-        """Raise, since models of several parts are built by another option.
+    def of(cls, template: Mesh, control_points: tuple[int, int] | None) -> Articulated:
+        """Raise, since a mesh does not state its parts.
 
         Raises:
             InputError: always.
@@ -273,12 +272,6 @@ class Articulated:
             "Models of several parts have the representation articulated if their relative pose is modelled; set "
             "relative_pose (--relative-pose) instead of the representation."
         )
-
-    @classmethod
-    def of(cls, template: Mesh, control_points: tuple[int, int] | None) -> Articulated:
-        """Raise as `check` does, since a mesh does not state its parts."""
-        cls.check(control_points)
-        raise AssertionError
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]]) -> Articulated:

@@ -16,6 +16,9 @@
   Studio.Include = ({ specimen, label }) => html`<label class="include"><input type="checkbox" checked=${specimen.included} aria-label=${S.includeOne(specimen.id)} data-testid=${`include-${specimen.id}`}
     disabled=${specimen.state === "unusable" || Studio.state.read_only} onchange=${(event) => include(specimen, event.target)} />${label && html`<span aria-hidden="true">${label}</span>`}</label>`;
 
+  /** The scans of a specimen: its own, and those of its further parts. */
+  Studio.scansOf = (specimen) => [specimen, ...(specimen.part ? Studio.state.project.specimens.filter((one) => one.subject === specimen.id) : [])];
+
   /** The number of landmarks that are placed on a scan. */
   Studio.placed = (specimen) => Object.keys(specimen.points).length;
 
@@ -23,7 +26,7 @@
   Studio.ShowScan = function ShowScan({ specimen }) {
     const [open, setOpen] = useState(false);
     if (specimen.state === "waiting") return null;
-    return html`<${Button} small class="quiet show-scan" aria-label=${S.scan.show(specimen.id)} testid=${`show-${specimen.id}`} onclick=${() => setOpen(true)}>${S.scan.open}<//>
+    return html`<${Button} small class="quiet show-scan" aria-label=${S.scan.show(specimen.id)} testid=${`show-${specimen.id}`} onclick=${() => setOpen(true)}>${specimen.part || S.scan.open}<//>
       ${open && html`<${Studio.Scan} key=${specimen.file} specimen=${specimen} onclose=${() => setOpen(false)} />`}`;
   };
 
@@ -33,7 +36,7 @@
 
   /** Why a scan cannot be used; repairs and notes in one line, which unfolds. */
   Studio.Findings = ({ specimen }) => {
-    const line = (finding) => html`<p class=${`finding ${finding.level}`} title=${finding.text}>${S[finding.level]}${finding.text}</p>`;
+    const line = (finding) => html`<p class=${`finding ${finding.level}`} title=${finding.text}>${specimen.part && `${specimen.part}: `}${S[finding.level]}${finding.text}</p>`;
     const refused = specimen.findings.filter((finding) => finding.level === "refused"), others = specimen.findings.filter((finding) => finding.level !== "refused");
     return html`
       ${specimen.state === "waiting" && html`<p class="finding waiting">${S.states.waiting}</p>`}
@@ -52,20 +55,22 @@
 
   function Card({ specimen, groups, names, views, selected, onselect }) {
     const tags = [specimen.set === "new" && S.new, specimen.mirrored && S.mirrored, specimen.groomed && S.groom.done, specimen.unit && S.unit(specimen.unit)].filter(Boolean);
+    const scans = Studio.scansOf(specimen);
     return useMemo(() => html`
       <li class=${`card ${specimen.included ? "" : "excluded"}`} data-testid=${`card-${specimen.id}`} data-state=${specimen.state}>
         <button type="button" class="picture" aria-pressed=${selected} data-testid=${`select-${specimen.id}`} onclick=${(event) => onselect(specimen.id, event)}>
           <span class="hidden">${S.selectOne(specimen.id)}</span>
-          ${specimen.state === "ready"
-            ? html`<img class=${specimen.mirrored ? "mirrored" : ""} src=${`/api/thumbnails/${encodeURIComponent(specimen.id)}?scan=${specimen.scan}`} alt="" loading="lazy" />`
-            : html`<span>${S.states[specimen.state]}</span>`}
+          ${scans.map((one) => html`<span class="scan">${one.state === "ready"
+            ? html`<img class=${one.mirrored ? "mirrored" : ""} src=${`/api/thumbnails/${encodeURIComponent(one.id)}?scan=${one.scan}`} alt="" loading="lazy" />`
+            : S.states[one.state]}</span>`)}
         </button>
-        <div class="row"><${Studio.Include} specimen=${specimen} /><strong title=${specimen.id}>${specimen.id}</strong><${Studio.ShowScan} specimen=${specimen} /></div>
+        <div class="row"><${Studio.Include} specimen=${specimen} /><strong title=${specimen.id}>${specimen.id}</strong>${!specimen.part && html`<${Studio.ShowScan} specimen=${specimen} />`}</div>
+        ${specimen.part && html`<div class="row parts">${scans.map((one) => html`<${Studio.ShowScan} key=${one.id} specimen=${one} />`)}</div>`}
         ${tags.length > 0 && html`<div class="row">${tags.map((tag) => html`<span class="tag">${tag}</span>`)}</div>`}
         ${groups !== "[]" && html`<div class="row">${JSON.parse(groups).map(([column, name, colour]) => html`<span class="tag group" title=${`${column}: ${name}`}>${colour && html`<i style=${{ background: colour }}></i>`}${name}</span>`)}</div>`}
         ${Studio.placed(specimen) > 0 && html`<p class="finding" data-testid=${`placed-${specimen.id}`}>${S.marks.placed(Studio.placed(specimen), names.length)}</p>`}
-        <${Studio.Findings} specimen=${specimen} />
-      </li>`, [specimen, groups, names, views, selected, onselect]);
+        ${scans.map((one) => html`<${Studio.Findings} key=${one.id} specimen=${one} />`)}
+      </li>`, [groups, names, views, selected, onselect, scans.length, ...scans]);
   }
 
   /** Specimens that differ from the others, each with its view and a unit in which it would not. */
@@ -153,11 +158,29 @@
       </form>`;
   }
 
+  /** Join scans called SPECIMEN_PART to specimens of several parts. */
+  function JoinParts({ selected, onclose }) {
+    const ends = selected.map((one) => /^.+[_.-]([^_.-]*[^\d_.-][^_.-]*)$/.exec(one.id)).filter(Boolean).map((found) => found[1]);
+    const [names, setNames] = useState([...new Set(ends)].join(", "));
+    const join = async (event) => {
+      event.preventDefault();
+      if (await Studio.edit({ what: "parts", ids: selected.map((one) => one.id), parts: names.split(",") })) onclose();
+    };
+    return html`
+      <form class="row inline" data-testid="parts-form" onsubmit=${join}>
+        <label>${S.parts.names} <input required size="24" data-testid="parts-names" value=${names} oninput=${(event) => setNames(event.target.value)} /></label>
+        <button class="small strong" data-testid="parts-join" disabled=${!names.trim()}>${S.parts.join}</button>
+        <${Button} small testid="parts-cancel" onclick=${onclose}>${T.cancel}<//>
+        <p class="hint">${S.parts.hint}</p>
+      </form>`;
+  }
+
   /** What is done with the selected specimens. */
   Studio.SelectionBar = function SelectionBar({ selected, onclear }) {
     const [removing, setRemoving] = useState(false);
     const [grouping, setGrouping] = useState(false);
     const [grooming, setGrooming] = useState(false);
+    const [joining, setJoining] = useState(false);
     if (Studio.state.read_only) return null;
     const ids = selected.map((one) => one.id);
     const toNew = selected.some((one) => one.set === "training"), mirrored = selected.some((one) => !one.mirrored);
@@ -169,6 +192,7 @@
         <${Button} small testid="exclude-selected" onclick=${() => include(false)}>${S.exclude}<//>
         <${Button} small testid="set-selected" onclick=${() => Studio.edit({ what: "set", ids, set: toNew ? "new" : "training" })}>${toNew ? S.toNew : S.toTraining}<//>
         <${Button} small testid="group-selected" disabled=${grouping} onclick=${() => setGrouping(true)}>${S.group}<//>
+        ${selected.length > 1 && selected.every((one) => !one.part) && html`<${Button} small testid="parts-selected" disabled=${joining} onclick=${() => setJoining(true)}>${S.parts.open}<//>`}
         <${Button} small testid="mirror-selected" onclick=${() => Studio.edit({ what: "mirror", ids, mirrored })}>${mirrored ? S.mirror : S.unmirror}<//>
         <${Button} small testid="groom-selected" disabled=${grooming} onclick=${() => setGrooming(true)}>${S.groom.open}<//>
         <label>${S.columns.unit} <${Studio.Unit} aria-label=${S.setUnit} data-testid="unit-selected" value=${selected.every((one) => one.unit === selected[0].unit) ? selected[0].unit : ""}
@@ -176,6 +200,7 @@
         <${Button} small testid="remove-selected" onclick=${() => setRemoving(true)}>${S.remove}<//>
         <${Button} small testid="clear-selection" onclick=${onclear}>${S.clear}<//>
         ${/* Last, on a line of its own: where it stood between the buttons, a click that met its closing went to another of them. */ grouping && html`<${Group} ids=${ids} onclose=${() => setGrouping(false)} />`}
+        ${joining && html`<${JoinParts} selected=${selected} onclose=${() => { setJoining(false); onclear(); }} />`}
         ${grooming && html`<${Studio.GroomForm} specimens=${selected} onclose=${() => setGrooming(false)} />`}
         ${removing && html`<${Confirm} title=${S.removeTitle(ids.length)} text=${S.removeText} action=${S.remove} onclose=${() => setRemoving(false)}
           onyes=${async () => { if (await Studio.edit({ what: "remove", ids })) onclear(); }} />`}
@@ -183,7 +208,8 @@
   };
 
   const matches = (specimen, words) => {
-    const text = [specimen.id, specimen.set === "new" ? S.new : "", ...Object.values(specimen.cells), ...specimen.findings.map((one) => one.text)].join(" ").toLowerCase();
+    const found = Studio.scansOf(specimen).flatMap((one) => [one.part, ...one.findings.map((finding) => finding.text)]);
+    const text = [specimen.id, specimen.set === "new" ? S.new : "", ...Object.values(specimen.cells), ...found].join(" ").toLowerCase();
     return words.every((word) => text.includes(word));
   };
 
@@ -193,7 +219,7 @@
     const [limit, setLimit] = useState(SHOWN);
     const [selection, setSelection] = useState(new Set());
     const words = filter.toLowerCase().split(/\s+/).filter(Boolean);
-    const listed = project.specimens.filter((one) => matches(one, words));
+    const listed = project.rows.filter((one) => matches(one, words));
     const shown = listed.slice(0, limit);
     const order = useRef({ listed, last: null });
     order.current.listed = listed;
@@ -206,17 +232,17 @@
       order.current.last = id;
       return after;
     }), []);
-    const selected = project.specimens.filter((one) => selection.has(one.id));
+    const selected = project.rows.filter((one) => selection.has(one.id));
     const all = listed.length > 0 && listed.every((one) => selection.has(one.id));
     const selectAll = () => setSelection(new Set(all ? [] : listed.map((one) => one.id)));
-    const included = project.specimens.filter((one) => one.included && one.state !== "unusable").length;
-    const unusable = project.specimens.filter((one) => one.state === "unusable").length;
+    const included = project.rows.filter((one) => one.included && one.state !== "unusable").length;
+    const unusable = project.rows.filter((one) => one.state === "unusable").length;
     const add = (files) => Studio.upload(files, "training");
     if (!project.specimens.length) return html`<${DropZone} testid="drop-zone" class="fill" onfiles=${add}><${UploadStatus} /><${Empty} /><//>`;
     return html`
       <${DropZone} testid="drop-zone" class="fill scroll" onfiles=${add}>
         <div class="row bar">
-          <h2 data-testid="specimens-summary">${S.summary(project.specimens.length, included, unusable)}</h2><span class="grow"></span>
+          <h2 data-testid="specimens-summary">${S.summary(project.rows.length, included, unusable)}</h2><span class="grow"></span>
           <${AddButtons} set="training" table />
           <${Button} strong=${included > 0} testid="next" onclick=${next}>${T.next.specimens}<//>
         </div>

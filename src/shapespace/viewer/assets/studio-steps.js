@@ -75,7 +75,7 @@
       landmarks: Object.entries(landmarks).map(([name, vertex]) => ({ name, vertex, refused })),
       onvertex: setClicked, onlandmark: (name, vertex) => save({ ...landmarks, [name]: vertex }),
     };
-    const training = project.specimens.filter((one) => one.included && one.set === "training" && one.state !== "unusable");
+    const training = project.rows.filter((one) => one.included && one.set === "training" && one.state !== "unusable");
     const busy = isBusy("correspond", "redo");
     const controls = html`
       <h2>${T.correspondence.title}</h2>
@@ -95,7 +95,7 @@
     const kinds = ["build", "quality", "morphospace"];
     const [job, select] = useResult(kinds);
     const [names, setNames] = useState([]); // those that are selected in the morphospace
-    const selected = project.specimens.filter((one) => names.includes(one.id));
+    const selected = project.rows.filter((one) => names.includes(one.id));
     const ready = Boolean(Studio.newest("correspond", "redo"));
     const built = Boolean(Studio.newest("build"));
     const sources = ["correspond", "redo"];

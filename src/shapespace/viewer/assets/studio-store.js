@@ -60,6 +60,7 @@
     const state = await json("/api/project");
     if (state.project) state.project.specimens.sort((a, b) => byName(a.id, b.id));
     reuse(state);
+    if (state.project) state.project.rows = state.project.specimens.filter((one) => !one.subject);
     Studio.state = state;
     Studio.changed();
   }

@@ -79,6 +79,7 @@
 
   function Row({ specimen, row, columns, names, views, selected, onselect, onblock }) {
     // Unchanged rows are not compared again; the state keeps unchanged specimens.
+    const scans = Studio.scansOf(specimen);
     return useMemo(() => html`
       <tr class=${`${specimen.included ? "" : "excluded"} ${selected ? "selected" : ""}`} data-testid=${`row-${specimen.id}`}>
         <td class="tick"><input type="checkbox" checked=${selected} aria-label=${S.selectOne(specimen.id)} data-testid=${`select-${specimen.id}`} onclick=${(event) => onselect(specimen.id, event)} /></td>
@@ -93,9 +94,9 @@
         ${names.length > 0 && html`<td class="number" data-testid=${`placed-${specimen.id}`}>${Studio.placed(specimen) || ""}</td>`}
         <td class="number">${specimen.extent ? specimen.extent.toLocaleString("en", { maximumSignificantDigits: 3 }) : ""}</td>
         <td class="number">${specimen.triangles ? specimen.triangles.toLocaleString("en") : ""}</td>
-        <td><${Studio.ShowScan} specimen=${specimen} /></td>
-        <td class="findings"><${Studio.Findings} specimen=${specimen} /></td>
-      </tr>`, [specimen, row, columns, names, views, selected, onselect, onblock]);
+        <td>${scans.map((one) => html`<${Studio.ShowScan} key=${one.id} specimen=${one} />`)}</td>
+        <td class="findings">${scans.map((one) => html`<${Studio.Findings} key=${one.id} specimen=${one} />`)}</td>
+      </tr>`, [scans.length, ...scans, row, columns, names, views, selected, onselect, onblock]);
   }
 
   function AddColumn() {

@@ -46,6 +46,10 @@
       columns: { id: "Specimen", use: "Use", set: "Set", unit: "Unit", mirror: "Mirror", extent: "Extent", size: "Triangles", findings: "Findings" },
       unit: (name) => ({ "": "as it is", um: "\u00b5m" })[name] || name, unitOf: (id) => `Unit of ${id}`, setUnit: "Set the unit", mirrorOne: (id) => `Use the mirror image of ${id}`,
       group: "Make a group", groupIn: "Column", groupName: "Group", groupColumn: "group",
+      parts: {
+        open: "Join parts", join: "Join", names: "Parts, by the ends of the names",
+        hint: "Scans such as anna_femur and anna_tibia become one specimen, anna. Relative poses are those to the first part.",
+      },
       mirror: "Mirror", unmirror: "Do not mirror", mirrored: "mirrored",
       cell: (column, id) => `${column} of ${id}`, rename: (id) => `Name of ${id}`, tableLabel: "Table of specimens",
       pasteHint: "Click a cell to edit it; Enter and the arrow keys move. Paste a sheet of a spreadsheet with its names into the first cell, or a block of values into the cell where it begins.",

@@ -33,7 +33,7 @@ from shapespace.io.meshes.mesh_io import MESH_ENDINGS, MESH_FILE_ENDINGS
 from shapespace.io.volume_io import VOLUME_ENDINGS
 from shapespace.reprs import first_names
 from shapespace.schemas import read
-from shapespace.types import MM_PER_UNIT
+from shapespace.types import MM_PER_UNIT, FloatArray
 from shapespace.version import __version__
 from shapespace.viewer.guard import Access, Guard, refusal
 from shapespace.viewer.server import (
@@ -148,15 +148,27 @@ class OpenProject:
         """
         facts = self._checked() if checked is None else checked
         key = [
-            (specimen.id, specimen.unit or "mm", facts[specimen.id]["size"], facts[specimen.id]["profile"])
+            (
+                specimen.part,
+                specimen.id,
+                specimen.unit or "mm",
+                facts[specimen.id]["size"],
+                facts[specimen.id]["profile"],
+            )
             for specimen in self.project.state.specimens
             if specimen.included and "profile" in facts.get(specimen.id, ())
         ]
 
         def find() -> dict[str, OddScan]:
-            measures = [ScanMeasures(size, np.array(profile)) for _, _, size, profile in key]
-            found = find_odd_scans(measures, [unit for _, unit, _, _ in key])
-            return {key[k][0]: odd for k, odd in found.items()}
+            return {
+                of_part[k][1]: odd
+                for part in dict.fromkeys(row[0] for row in key)  # scans of one part are compared
+                for of_part in [[row for row in key if row[0] == part]]
+                for k, odd in find_odd_scans(
+                    [ScanMeasures(size, np.array(profile)) for *_, size, profile in of_part],
+                    [unit for _, _, unit, _, _ in of_part],
+                ).items()
+            }
 
         return self.project.cached(("odd scans", *key), find)
 
@@ -176,12 +188,11 @@ class OpenProject:
         ]
 
         def find() -> list[str]:
-            samples = {
-                specimen.id: self.checks.sample(project.path(specimen), mirrored=specimen.mirrored)
-                for specimen in chosen
-            }
-            known = {name: sample for name, sample in samples.items() if sample is not None}
-            return [list(known)[k] for k in find_mirrored_scans(list(known.values()))]
+            samples: dict[str, dict[str, FloatArray]] = {}
+            for specimen in chosen:
+                sample = self.checks.sample(project.path(specimen), mirrored=specimen.mirrored)
+                samples.setdefault(specimen.part, {}).update({} if sample is None else {specimen.id: sample})
+            return [list(own)[k] for own in samples.values() for k in find_mirrored_scans(list(own.values()))]
 
         return project.cached(("mirrored scans", *key), find)
 
@@ -230,6 +241,7 @@ class OpenProject:
                 "id": specimen.id, "file": specimen.file, "set": specimen.role, "included": specimen.included,
                 "unit": specimen.unit, "mirrored": specimen.mirrored, "groomed": bool(specimen.original),
                 "cells": specimen.cells, "points": specimen.points,
+                "part": specimen.part, "subject": specimen.subject,
                 "scan": scan_key(project.path(specimen), project.folder),
                 **{key: fact for key, fact in facts.items() if key not in ("profile", "content", "box")},
                 "findings": [{**finding, "text": self._sentence(finding["text"])} for finding in facts["findings"]],

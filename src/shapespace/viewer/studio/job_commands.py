@@ -52,6 +52,11 @@ QUESTIONS = (
 CORRESPONDENCES = ("correspond", "redo")
 _STUDY = (*CORRESPONDENCES, "build", "quality", "morphospace", *QUESTIONS[:-1], "fit", "complete")
 """Kinds of results in the report of the study, in the order of its chapters."""
+_OUTPUTS = {
+    "correspond": "correspondence-{}", "surface": "surfaces/{:04d}", "groom": "groomed/{:04d}", "build": "model-{}.h5",
+    "quality": "quality-{}", "fit": "fits-{}", "complete": "completed-{}", "report": "report-{}/report.html",
+}  # fmt: skip
+"""Kind of job -> its result in the folder of the project, with the number of the job; exports for all others."""
 _INPUTS = "inputs"
 _NAMES = ("name", "files", "ids", "set")
 """Keys of the options of a job that name scans or volumes; all others are options of its command."""
@@ -144,39 +149,37 @@ def order(
     given = _option_arguments(forms, kind, {flag: options[flag] for flag in options if flag not in _NAMES})
     folder, stem = project.folder, f"{_INPUTS}/{number:04d}"
     state, listed = project.state, f"{stem}.csv"
+    output = _OUTPUTS.get(kind, "exported-{}").format(number)
     if kind == "correspond":
         chosen = _require_specimens(state.chosen("training"), "to bring into correspondence", 2)
         files, prepared = project.scan_list(folder / listed, chosen)
-        output = f"correspondence-{number}"
-        words = (*words, listed, "-o", output, *given)
+        parts = ("--parts", *state.parts) if any(specimen.part for specimen in chosen) else ()
+        words = (*words, listed, "-o", output, *parts, *given)
         return Order(words, output, prepared, files=files, scans=_keys_of(chosen, scans))
     if kind == "redo":
         before = result_of(jobs, CORRESPONDENCES, on)
         name = str(options.get("name", ""))
-        chosen = [specimen for specimen in state.specimens if specimen.id == name]
+        chosen = [specimen for specimen in state.specimens if specimen.id in state.with_parts([name])]
         if not chosen:
             raise InputError(f"There is no specimen {name[:40]!r}; choose one of the list.")
         files, prepared = project.scan_list(folder / listed, chosen)
         redone = (*words, listed, "--redo", name, "-o", before.output)
         return Order(redone, before.output, prepared, files=files, scans=_keys_of(chosen, scans))
     if kind == "surface":
-        output = f"surfaces/{number:04d}"
         return Order((*words, *stored_volumes(project, options.get("files")), "-o", output, *given), output)
     if kind == "groom":
         ids = options.get("ids")
-        chosen = [specimen for specimen in state.specimens if isinstance(ids, list) and specimen.id in ids]
+        ids = state.with_parts(cast(list[Any], ids)) if isinstance(ids, list) else ()
+        chosen = [specimen for specimen in state.specimens if specimen.id in ids]
         if not chosen or not given:
             raise InputError("Select the specimens to groom, and choose a step.")
-        output = f"groomed/{number:04d}"
         return Order((*words, *(specimen.file for specimen in chosen), "-o", output, *given, "--quiet"), output)
     if kind == "build":
         before = result_of(jobs, CORRESPONDENCES, on)
-        output = f"model-{number}.h5"
         files = {} if "--landmarks" in options else _landmark_files(project, before.output, stem)
         marks = ("--landmarks", *files) if files else ()
         return Order((*words, *_surfaces(project, before), "-o", output, *marks, *given), output, files=files)
     if kind == "quality":
-        output = f"quality-{number}"
         surfaces = _surfaces(project, result_of(jobs, CORRESPONDENCES, on))
         return Order((*words, *surfaces, "-o", output, *given), output)
     if kind in ("fit", "complete"):
@@ -185,13 +188,11 @@ def order(
         has_points, path = any(specimen.points for specimen in chosen), folder / model
         names = _landmark_names(path, path.stat().st_mtime if path.is_file() else 0.0) if has_points else ()
         files, prepared = project.scan_list(folder / listed, chosen, names)
-        output = f"{'fits' if kind == 'fit' else 'completed'}-{number}"
         keys = _keys_of(chosen, scans)
         return Order((*words, model, listed, "-o", output, *given), output, prepared, files=files, scans=keys)
     if kind == "landmarks":
         return _export_landmarks(project, words, given, str(options.get("--to", "")), number)
     if kind == "report" and on is None:
-        output = f"report-{number}/report.html"
         results = [job.output for job in _results_of_study(jobs)]
         files = {listed: project.table(specimen for specimen in state.specimens if specimen.included)}
         return Order((*words, *results, "--specimens", listed, "-o", output, "--no-open", *given), output, files=files)
@@ -203,10 +204,9 @@ def order(
         return Order((*words, before.output, *given), before.output)
     if kind == "convert":
         model, to = result_of(jobs, ("build",), on).output, str(options.get("--to", ""))
-        output = f"exported-{number}{_model_ending(to)}"
-        return Order((*words, model, output, *given), output)
+        return Order((*words, model, f"{output}{_model_ending(to)}", *given), f"{output}{_model_ending(to)}")
     if kind == "export":
-        output, fits = f"exported-{number}", result_of(jobs, ("fit",), on).output
+        fits = result_of(jobs, ("fit",), on).output
         excluded = {specimen.id for specimen in state.specimens if not specimen.included and specimen.role == "new"}
         names = [name for name in Results(folder / fits).names() if name not in excluded] if excluded else ["--all"]
         if not names:
@@ -344,8 +344,9 @@ def _specimens_of(project: Project, shapes: Job | None, options: Mapping[str, An
     """Return the included specimens that a job with shapes has: fits are of new scans."""
     if shapes is not None and shapes.number == PLACED:
         placed = placed_landmarks(project, options)
-        return [specimen for specimen in project.state.chosen("training") if specimen.id in placed.points]
-    return project.state.chosen("new" if shapes is not None and shapes.kind == "fit" else "training")
+        return [row for row in project.state.chosen("training", with_parts=False) if row.id in placed.points]
+    is_fit = shapes is not None and shapes.kind == "fit"  # of one scan each
+    return project.state.chosen("new" if is_fit else "training", with_parts=is_fit)
 
 
 def _by_class(specimens: Sequence[Specimen], named: Any) -> tuple[Sequence[Specimen], Sequence[Specimen]]:
@@ -658,12 +659,12 @@ def _change_since(
 
 
 def _scans_of(scans: str, number: int) -> dict[str, tuple[str, str]]:
-    """Return id -> file of the scan and of its landmarks, in a list of scans that the job with this number reads.
+    """Return id and part -> file of the scan and of its landmarks, in a list of scans that a job with this number read.
 
     The number is removed from files that were written for the job. A file of landmarks is empty without landmarks.
     """
     return {
-        row["id"]: (
+        f"{row['id']} {row.get('part', '')}": (
             row["file"].removeprefix(f"{number:04d}-"),
             row.get(LANDMARK_COLUMN, "").removeprefix(f"{number:04d}-"),
         )
@@ -723,7 +724,7 @@ def _surfaces(project: Project, before: Job) -> list[str]:
 
     A surface without a specimen is that of a removed one, unless a specimen without a surface may be a renamed one.
     """
-    chosen = project.state.chosen("training")
+    chosen = _specimens_of(project, None, {})
     included, there = _surface_files(project, before, chosen), _surface_names(project, before)
     others = there.intersection(specimen.id for specimen in project.state.specimens).difference(included)
     if len(included) == len(chosen):

@@ -69,7 +69,7 @@ def placed_landmarks(project: Project, options: Mapping[str, Any]) -> PlacedLand
     question.
     """
     state, missing = project.state, str(options.get(MISSING_LANDMARKS))
-    chosen = state.chosen("training")
+    chosen = state.chosen("training", with_parts=False)
     key = (chosen, state.point_names, state.curves, missing)
     return project.cached(key, lambda: _landmarks_of(chosen, state, missing))
 

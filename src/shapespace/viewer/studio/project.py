@@ -51,6 +51,8 @@ Point: TypeAlias = tuple[float, float, float]
 _Made = TypeVar("_Made")
 
 _AGAIN = "restore it from a copy, or start a new project"
+_PART = "part"
+"""Column of a list of scans that names the structure on each scan."""
 _MOST_CLASSES = 12  # classes of a column that the page counts
 LANDMARK_COLUMN = "landmarks"
 """Column of a list of scans that names their files of landmarks."""
@@ -78,6 +80,8 @@ class Specimen(Struct, frozen=True, kw_only=True):
         unit: unit of the scan, a name of `MM_PER_UNIT`; empty if commands read the scan as it is.
         mirrored: whether its mirror image is used.
         original: path of the scan before it was groomed, like `file`; empty if it was not groomed.
+        part: structure that the scan shows, such as femur; empty if specimens have one scan each.
+        subject: id of the specimen whose further part this is; empty for specimens that have rows in tables.
         cells: column -> cell of the specimen.
         points: name -> landmark on the scan, in the frame and unit of its file.
     """
@@ -89,6 +93,8 @@ class Specimen(Struct, frozen=True, kw_only=True):
     unit: str = ""
     mirrored: bool = False
     original: str = ""
+    part: str = ""
+    subject: str = ""
     cells: dict[str, str] = {}
     points: dict[str, Point] = {}
 
@@ -127,6 +133,7 @@ class State(Struct, frozen=True, kw_only=True):
         name: name of the project.
         columns: columns of the table, except the id.
         specimens: specimens in the order in which they were added.
+        parts: names of the parts of specimens, the reference of relative poses first; empty for one scan per specimen.
         point_names: names of the landmarks on scans, in their order in files.
         curves: name -> curve whose points are among these landmarks.
         pairs: pairs of names of landmarks that mirror each other; None for those that their names show.
@@ -143,6 +150,7 @@ class State(Struct, frozen=True, kw_only=True):
     name: str
     columns: tuple[str, ...] = ()
     specimens: tuple[Specimen, ...] = ()
+    parts: tuple[str, ...] = ()
     point_names: tuple[str, ...] = ()
     curves: dict[str, ScanCurve] = {}
     pairs: tuple[tuple[str, str], ...] | None = None
@@ -168,24 +176,39 @@ class State(Struct, frozen=True, kw_only=True):
         named = (pair for pair in found if {*pair} <= {*self.point_names})
         return tuple(pair for pair in named if counts.get(pair[0]) == counts.get(pair[1]))
 
-    def chosen(self, role: Role) -> tuple[Specimen, ...]:
-        """Return the included specimens of a role by name: the order in which they were added differs between drops."""
-        chosen = (specimen for specimen in self.specimens if specimen.included and specimen.role == role)
+    def chosen(self, role: Role, *, with_parts: bool = True) -> tuple[Specimen, ...]:
+        """Return the included specimens of a role by name: the order in which they were added differs between drops.
+
+        Args:
+            role: role of the specimens.
+            with_parts: whether the further parts of specimens are among them.
+        """
+        of_role = self.specimens if with_parts else self.rows
+        chosen = (specimen for specimen in of_role if specimen.included and specimen.role == role)
         return tuple(sorted(chosen, key=lambda specimen: name_key(specimen.id)))
+
+    @property
+    def rows(self) -> tuple[Specimen, ...]:
+        """The specimens that have rows in tables: the first part of each."""
+        return tuple(specimen for specimen in self.specimens if not specimen.subject)
+
+    def with_parts(self, ids: Iterable[str]) -> set[str]:
+        """Return the ids of specimens, and those of their further parts."""
+        return {*ids}.union(specimen.id for specimen in self.specimens if specimen.subject in {*ids})
 
     def notes(self) -> list[str]:
         """Return sentences on classes of the table that may be misspelt."""
-        cells = {column: [specimen.cells.get(column, "") for specimen in self.specimens] for column in self.columns}
+        cells = {column: [specimen.cells.get(column, "") for specimen in self.rows] for column in self.columns}
         notes = [note for column in self.columns for note in notes_on_classes(column, cells[column])]
         return [note for note in notes if not note.startswith("Shapes in each class")]
 
     def counts(self) -> dict[str, dict[str, int]]:
         """Return the number of included specimens of each class, of columns with few classes that specimens share."""
-        counts: dict[str, dict[str, int]] = {}
+        counts, rows = dict[str, dict[str, int]](), self.rows
         for column in self.columns:
-            of_all = Counter(specimen.cells.get(column, "") for specimen in self.specimens)
+            of_all = Counter(specimen.cells.get(column, "") for specimen in rows)
             if len(of_all) <= _MOST_CLASSES and any(name and count > 1 for name, count in of_all.items()):
-                used = Counter(specimen.cells.get(column, "") for specimen in self.specimens if specimen.included)
+                used = Counter(specimen.cells.get(column, "") for specimen in rows if specimen.included)
                 counts[column] = {name: used[name] for name in of_all}
         return counts
 
@@ -503,19 +526,23 @@ class Project:
             scans = [specimen.file for specimen in group]
             options = [*([f"--unit={unit}"] if unit else []), *(["--mirror"] if mirrored else [])]
             commands.append(("check", *scans, "-o", f"{path.parent.name}/{folder}", *options, "--quiet"))
+        cells = {specimen.id: specimen.cells for specimen in self.state.specimens}
+        has_parts = names is None and any(specimen.part for specimen in specimens)  # fits are of one scan each
         rows = [
-            (specimen.id, files[specimen.id], *(specimen.cells.get(column, "") for column in columns),
+            ((specimen.subject if has_parts else "") or specimen.id, files[specimen.id],
+             *([specimen.part] if has_parts else []),
+             *(cells[specimen.subject or specimen.id].get(column, "") for column in columns),
              *([f"{marks_folder}/{specimen.id}.csv" if specimen.id in marks else ""] if marks else []))
             for specimen in specimens
         ]  # fmt: skip
-        header = ("id", "file", *columns, *([LANDMARK_COLUMN] if marks else []))
+        header = ("id", "file", *([_PART] if has_parts else []), *columns, *([LANDMARK_COLUMN] if marks else []))
         texts = {f"{path.parent.name}/{path.name}": table_text(header, rows)}
         texts |= {f"{path.parent.name}/{marks_folder}/{name}.csv": text for name, text in marks.items()}
         return texts, tuple(commands)
 
     def table(self, specimens: Iterable[Specimen]) -> str:
         """Return the table of specimens, as `compare` reads it."""
-        columns, chosen = self.state.columns, tuple(specimens)
+        columns, chosen = self.state.columns, tuple(specimen for specimen in specimens if not specimen.subject)
 
         def make() -> str:
             rows = [(specimen.id, *(specimen.cells.get(column, "") for column in columns)) for specimen in chosen]
@@ -706,10 +733,11 @@ def change_of(request: Mapping[str, Any]) -> Callable[[State], tuple[str, State]
     """
     what = str(request.get("what", ""))
     edits = {
-        "cells": _edit_cells, "block": _edit_block, "include": _include, "set": _set_role, "remove": _remove,
-        "rename": _rename, "unit": _set_unit, "mirror": _mirror, "original": _use_original, "add-column": _add_column,
-        "remove-column": _remove_column, "landmarks": _set_landmarks, "points": _edit_points,
-        "point-names": _set_point_names, "views": _set_views, "curve": _set_curve, "pair": _set_pair,
+        "cells": _edit_cells, "block": _edit_block, "include": _set_field, "set": _set_field, "remove": _remove,
+        "rename": _rename, "unit": _set_field, "mirror": _set_field, "original": _use_original, "parts": _join_parts,
+        "add-column": _add_column, "remove-column": _remove_column, "landmarks": _set_landmarks,
+        "points": _edit_points, "point-names": _set_point_names, "views": _set_views, "curve": _set_curve,
+        "pair": _set_pair,
     }  # fmt: skip
 
     def change(state: State) -> tuple[str, State]:
@@ -756,47 +784,33 @@ def _edit_block(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
     return with_cells((), cells)(state)
 
 
-def _include(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
-    ids, included = request["ids"], bool(request["included"])
-    edited = _edit_specimens(state, ids, lambda specimen: replace(specimen, included=included))
-    return f"{'include' if included else 'exclude'} {_count_text(ids)}", edited
-
-
-def _set_unit(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
-    ids, unit = request["ids"], request["unit"]
-    if unit and unit not in MM_PER_UNIT:
-        raise InputError(f"There is no unit {unit!r:.30}; choose one of {', '.join(MM_PER_UNIT)}.")
-    return f"set the unit of {_count_text(ids)}", _edit_specimens(
-        state, ids, lambda specimen: replace(specimen, unit=unit)
-    )
-
-
-def _mirror(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
-    ids, mirrored = request["ids"], bool(request["mirrored"])
-    return f"mirror {_count_text(ids)}", _edit_specimens(
-        state, ids, lambda specimen: replace(specimen, mirrored=mirrored)
-    )
+def _set_field(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
+    """Set the use, unit, side or role of specimens and of their parts."""
+    what, ids = str(request["what"]), request["ids"]
+    field = {"include": "included", "unit": "unit", "mirror": "mirrored", "set": "role"}[what]
+    value = request["set" if what == "set" else field]
+    if what == "unit" and value and value not in MM_PER_UNIT:
+        raise InputError(f"There is no unit {value!r:.30}; choose one of {', '.join(MM_PER_UNIT)}.")
+    new = {"set": "new" if value == "new" else "training", "unit": value}.get(what, bool(value))
+    text = {"include": "include" if value else "exclude", "unit": "set the unit of", "set": "move"}.get(what, what)
+    changed = _edit_specimens(state, state.with_parts(ids), lambda specimen: replace(specimen, **{field: new}))
+    return f"{text} {_count_text(ids)}", changed
 
 
 def _use_original(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
     """Return the state in which groomed specimens have their original scans again."""
     ids = request["ids"]
     return f"use the original scan of {_count_text(ids)}", _edit_specimens(
-        state, ids, lambda specimen: replace(specimen, file=specimen.original or specimen.file, original="")
-    )
-
-
-def _set_role(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
-    role: Role = "new" if request["set"] == "new" else "training"
-    return f"move {_count_text(request['ids'])}", _edit_specimens(
-        state, request["ids"], lambda specimen: replace(specimen, role=role)
+        state,
+        state.with_parts(ids),
+        lambda specimen: replace(specimen, file=specimen.original or specimen.file, original=""),
     )
 
 
 def _remove(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
-    gone = set(request["ids"])
+    gone = state.with_parts(request["ids"])
     _edit_specimens(state, gone, lambda specimen: specimen)
-    return f"remove {_count_text(gone)}", replace(
+    return f"remove {_count_text(request['ids'])}", replace(
         state, specimens=tuple(specimen for specimen in state.specimens if specimen.id not in gone)
     )
 
@@ -807,7 +821,34 @@ def _rename(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
         raise InputError(f"A specimen cannot be called {new[:40]!r}, as files of results are called so.")
     if any(specimen.id.casefold() == new.casefold() for specimen in state.specimens if specimen.id != old):
         raise InputError(f"There is a specimen {new} already; choose another name.")
+    parts = tuple(replace(part, subject=new) if part.subject == old else part for part in state.specimens)
+    state = replace(state, specimens=parts)
     return f"rename {old}", _edit_specimens(state, [old], lambda specimen: replace(specimen, id=new))
+
+
+def _join_parts(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
+    """Return the state in which scans called SPECIMEN_PART are parts of one specimen, whose first part has its row."""
+    parts = tuple(dict.fromkeys(str(part).strip() for part in request["parts"]))
+    ending = re.compile(rf"(.+)[_.-]({'|'.join(map(re.escape, parts))})")
+    known = {name: (match[1], match[2]) for name in request["ids"] if (match := ending.fullmatch(name)) and match[2]}
+    if len(parts) < 2 or len(known) < len(request["ids"]):
+        lacking = next((name for name in request["ids"] if name not in known), "")
+        raise InputError(
+            f"Name two or more parts in which the names of the scans end, such as femur for anna_femur"
+            f"{f'; {lacking} ends in none of them' if lacking else ''}."
+        )
+    rows: dict[str, str] = {}
+    for name, (subject, _) in sorted(known.items(), key=lambda scan: parts.index(scan[1][1])):
+        rows.setdefault(subject, name)
+    if taken := sorted(rows.keys() & {specimen.id for specimen in state.specimens}):
+        raise InputError(f"There is a specimen {taken[0]} already; rename it.")
+
+    def join(specimen: Specimen) -> Specimen:
+        subject, part = known[specimen.id]
+        is_row = rows[subject] == specimen.id
+        return replace(specimen, id=subject if is_row else specimen.id, subject="" if is_row else subject, part=part)
+
+    return f"join the parts of {_count_text(rows)}", replace(_edit_specimens(state, known, join), parts=parts)
 
 
 def _add_column(state: State, request: Mapping[str, Any]) -> tuple[str, State]:
@@ -989,7 +1030,7 @@ def cells_of_table(
         FileFormatError: it is no such table, or two rows are of one specimen.
         InputError: no row is of a specimen.
     """
-    table = read_table(Path(name), content)
+    table, state = read_table(Path(name), content), replace(state, specimens=state.rows)
     reserved = [head for head in table.columns if not _can_be_column(head)]
     matched, notes = match_rows(table, state.names, "the project", "name the specimens alike")
     cells = {
