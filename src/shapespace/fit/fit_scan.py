@@ -6,7 +6,7 @@ import hashlib
 import os
 import re
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache, partial
@@ -295,7 +295,25 @@ def fit_scan(
         limits = config.limits(model)
         if held is not None:
             limits = replace(limits, modes=None, part=True)
-        driven = _run_method(config.fitting.states(own, placed.target, placed.start, limits), placed, held, on_state)
+        states, history, phase_2_from = (
+            config.fitting.states(own, placed.target, placed.start, limits),
+            list[IcpState](),
+            clock[-1],
+        )
+        try:
+            while True:
+                state = next(states)
+                if state.phase == 2 and (not history or history[-1].phase == 1):
+                    phase_2_from = time.perf_counter()
+                history.append(state)
+                if on_state is not None:
+                    on_state(state if held is None else held.state(state))
+                _check_scale(state, placed)
+        except StopIteration as end:
+            driven = _MethodRun(history, phase_2_from, end.value)
+        except InputError as error:
+            advice = "give landmarks (--landmarks), or crop the scan (--crop)"
+            raise FitError(f"{placed.scan.name}: the fit diverged ({error}); {advice}.") from error
         clock.append(time.perf_counter())
         stages = _measure_stages(own, placed, driven, config)
         clock.append(time.perf_counter())
@@ -405,33 +423,13 @@ class _MethodRun:
         return {state.phase: state for state in self.history}
 
 
-def _run_method(
-    states: Generator[IcpState, None, Fitted], placed: _PlacedScan, held: RegionFit | None, on_state: OnState | None
-) -> _MethodRun:
-    """Return the states and the end of a method.
-
-    Raises:
-        FitError: the model has shrunk to a point, or the fit diverged.
-    """
-    history, phase_2_from, name = list[IcpState](), time.perf_counter(), placed.scan.name
-    try:
-        while True:
-            state = next(states)
-            if state.phase == 2 and (not history or history[-1].phase == 1):
-                phase_2_from = time.perf_counter()
-            history.append(state)
-            if on_state is not None:
-                on_state(state if held is None else held.state(state))
-            if state.T_scan_model.scale < _VANISHED * placed.start.T_scan_model.scale:
-                raise FitError(
-                    f"{name}: the model shrank to a point, as the plain method does when a large part of the scan is "
-                    "missing; fix the scale (--scale fixed), or fit only the part that it shows (--region)."
-                )
-    except StopIteration as end:
-        return _MethodRun(history, phase_2_from, end.value)
-    except InputError as error:
-        advice = "give landmarks (--landmarks), or crop the scan (--crop)"
-        raise FitError(f"{name}: the fit diverged ({error}); {advice}.") from error
+def _check_scale(state: IcpState, placed: _PlacedScan) -> None:
+    """Raise a FitError if the model has shrunk to a point."""
+    if state.T_scan_model.scale < _VANISHED * placed.start.T_scan_model.scale:
+        raise FitError(
+            f"{placed.scan.name}: the model shrank to a point, as the plain method does when a large part of the scan "
+            "is missing; fix the scale (--scale fixed), or fit only the part that it shows (--region)."
+        )
 
 
 def _place_scan(
