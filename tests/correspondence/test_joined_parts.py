@@ -123,6 +123,12 @@ def test_a_part_in_another_unit_is_doubted() -> None:
     assert set(found) == {"k5"} and "different units" in found["k5"] and "tibia 0.001" in found["k5"]
 
 
+def test_parts_that_lie_inside_each_other_are_noted() -> None:
+    at_femur = knee(5) | {"tibia": knee(5)["tibia"] + 0.5 * (knee(5)["femur"] - knee(5)["tibia"]).mean(axis=0)}
+    own = {scan.name: " ".join(scan.notes) for scan in join_parts(knees(k5=at_femur)).scans}
+    assert "inside" in own.pop("k5") and not any("inside" in note for note in own.values())
+
+
 def test_parts_in_frames_of_their_own_are_noted_once() -> None:
     frames = {
         f"k{i}": knee(i)

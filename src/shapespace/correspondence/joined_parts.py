@@ -22,6 +22,7 @@ from shapespace.correspondence.scan_status import SurfaceMeasures
 from shapespace.correspondence.settings import FEWEST, SIZE
 from shapespace.errors import InputError
 from shapespace.geometry.articulation import Articulation, articulate
+from shapespace.geometry.contact import find_penetrations
 from shapespace.geometry.mirror_plane import FLIP, mirror_image
 from shapespace.geometry.normals import faces_of, rms_size
 from shapespace.geometry.similarity import fit_similarity
@@ -31,11 +32,14 @@ from shapespace.types import FloatArray, Mesh, Similarity, SurfaceLandmarks
 _TO_STDDEV = 1.4826  # MAD to standard deviation of a normal distribution: 1 / 0.6745
 _FALSE_RATE = 0.05
 """Share of collections without odd specimens in which one is found by chance, for values with a Laplace distribution:
-sizes and poses multiply, so relative poses have longer tails than normal values. Of 300 collections of 6, 12, 20, 40 or
-80 simulated limbs 4 %, none, 1 %, none and 1 % had a false finding, and an error of 100 mm or of a random rotation was
-found in 95 to 99 %; with normal values 7, 16, 24, 55 and 82 % had one."""
+sizes and poses multiply, so relative poses have longer tails than normal values. Of 100 collections each of 6, 12, 20
+and 40 simulated limbs 5 %, none, 2 % and 1 % had a false finding, and an error of 100 mm with a random rotation was
+found in 92 % or more (benchmarks/structures.py); with normal values 7, 16, 24 and 55 % had one."""
 _SIMULATED = 400  # collections that determine the limit of unusual values
 _NO_FRAME = 0.01  # rate at which rotations without any common relative pose are taken for such with one
+_INSIDE = 0.05
+"""Depth of a part inside another, share of the size, from which on it is noted: noise, smoothing and a contact that is
+a little too close lead to 3 % in simulated knees, and to 4 % in hippocampi of two parts with a common boundary."""
 _SAME_POSE = 1e-6  # spread of relative poses below which all are equal, rad and mm
 
 
@@ -195,6 +199,7 @@ class _PartScans:
             self._doubt_units(name)
         self.complete = self._find_complete()
         starts = dict(zip(parts, np.cumsum([0, *self.counts.values()]).tolist(), strict=False))
+        self._rows = {part: np.arange(count, dtype=np.int32) + starts[part] for part, count in self.counts.items()}
         faces = [faces_of(own.template) + starts[part] for part, own in parts.items()]
         self.faces = np.concatenate(faces).astype(np.int32)
         every = [name for own in parts.values() for name in own.landmarks.names]
@@ -273,6 +278,13 @@ class _PartScans:
         if excluded := [f"{part}: {scan.reason}" for part, scan in own.items() if scan.reason]:
             return Corresponding(name, "; ".join([*self._doubts[name], *excluded]), notes=tuple(notes))
         vertices, T = self.placed(name, mean)
+        inside = find_penetrations(Mesh(vertices, self.faces), self._rows)
+        notes += [
+            f"{found.part} is up to {found.depth_mm:.3g} (unit of the scan) inside {found.other}, which parts of a "
+            "subject are not; check that their scans are in one frame."
+            for found in inside[:1]
+            if {found.part, found.other} <= {*self.present[name]} and found.depth_mm > _INSIDE * SIZE * T.scale
+        ]
         of_parts = [f"{part}: {scan.doubt}" for part, scan in own.items() if scan.doubt]
         doubts = [*self._doubts[name], *([doubt] if doubt else []), *of_parts]
         scans, weights = list(own.values()), [self.counts[part] for part in own]
