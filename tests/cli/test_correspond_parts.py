@@ -89,6 +89,7 @@ def test_other_commands_take_the_folder_as_any_other(run: Run, same: Path, tmp_p
     assert ShapeModel.load(tmp_path / "m.h5").n_vertices == summary(same)["vertices"]
     pytest.importorskip("matplotlib", reason="the extra `report` is not installed")
     assert run("report", same, "-o", tmp_path / "r.html", "--no-open", "--quiet").code == 0
+    assert "each part has a scan of its own" in (tmp_path / "r.html").read_text(encoding="utf-8")
 
 
 def test_a_part_with_wrong_sides_is_brought_into_correspondence_again_with_those_of_its_specimens(

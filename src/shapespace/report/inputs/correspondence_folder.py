@@ -193,7 +193,11 @@ class Corresponded:
             ScanNotFoundError: the scan was moved or changed, or cannot be read.
         """
         if record.path and not record.hash:
-            raise ScanNotFoundError("the scan cannot be read.")
+            raise ScanNotFoundError(
+                "each part has a scan of its own, which is in the report of the folder of the part."
+                if self.run.parts
+                else "the scan cannot be read."
+            )
         scan = unchanged_scan(self.root, record.path, record.hash)
         return mirror_image(scan) if record.mirrored else scan
 
