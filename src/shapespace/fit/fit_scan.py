@@ -121,9 +121,9 @@ _FAR_OUT_BY_CHANCE = 0.01  # share of coefficients beyond it up to which there i
 _ALL_BUT_THE_RIM = 0.95  # share of vertices; a complete scan still lacks vertices at its border
 _NO_TRIANGLES = "It has no triangles, so distances are to its points and larger than to the surface that they sample."
 _FAR_AWAY = 5.0  # standard deviations of the residuals; the median of normal ones is 0.7
-_OTHER_FRAME = 6.0
-"""Standard deviations of a relative pose in the model, beyond which parts are not in one frame: normal values exceed it
-once in 500 million, and frames that differ by chance do so by far more."""
+_UNLIKELY = 6.0
+"""Standard deviations of a relative pose in the model, beyond which a part has another pose than its fit alone: normal
+values exceed it once in 500 million, and other poses by far more."""
 _VANISHED = 0.05
 """Share of the start's scale below which the model counts as shrunk to a point."""
 
@@ -553,7 +553,7 @@ def _start_from_parts(
         with_scale: whether the scale is free.
 
     Raises:
-        FitError: two parts are exchanged or have different units, or a relative pose is unlike those of the model.
+        FitError: two parts are exchanged or have different units.
         InputError: the relative pose was removed from the model.
     """
     pose = relative_pose(model)
@@ -586,17 +586,14 @@ def _start_from_parts(
     scale = fits[sure[0]].T_scan_model.scale
     poses = articulation_of(model).poses_of(np.where(np.isnan(vertices), model.mean_vertices, vertices / scale))
     for joint, rotation, translation in zip(pose.joints, poses.rotation, poses.translation, strict=True):
-        turn_deg, shift_mm = float(np.rad2deg(np.linalg.norm(rotation))), float(np.linalg.norm(translation))
-        off = max(turn_deg / joint.rotation_deg, shift_mm / joint.translation_mm)
-        if {joint.part, joint.parent} <= set(sure) and off > _OTHER_FRAME:
-            raise FitError(
-                f"{scan_mm.name}: {joint.part} relative to {joint.parent} is rotated by {turn_deg:.0f} degrees and "
-                f"moved by {shift_mm:.0f} mm from the mean, {off:.0f} standard deviations; give scans of one subject "
-                "in one frame, or fit each part alone."
-            )
+        turn, shift = np.rad2deg(np.linalg.norm(rotation)), np.linalg.norm(translation)
+        # A part that looks alike from both ends, or is in another frame; the joint fit decides.
+        if max(turn / joint.rotation_deg, shift / joint.translation_mm) > _UNLIKELY and joint.parent in sure:
+            vertices[model.regions[joint.part]] = np.nan
     error_mm = max(fits[part].evidence.expected_error_mm for part in sure) / scale
     b, T = model.nearest_in_any_pose(vertices, with_scale=with_scale, noise=error_mm**2 / 3.0)
-    return Start(T, "parts", float("nan"), b)
+    is_complete = not any(np.isnan(vertices[model.regions[part]]).any() for part in scans)
+    return Start(T, "parts", float("nan"), b if is_complete else np.zeros(len(b)))  # the mean pose is nearer then
 
 
 def _parts_far_away(model: ShapeModel, scan: Mesh, fitted: Fitted, final: Stage) -> list[Reason]:
@@ -605,7 +602,10 @@ def _parts_far_away(model: ShapeModel, scan: Mesh, fitted: Fitted, final: Stage)
         return []
     distance_mm, limit_mm = final.distances.scan_to_model_mm, _FAR_AWAY * fitted.evidence.spread_mm
     return [
-        Reason.other(f"the fitted {part} is {median_mm:.1f} mm from the scan of it (median)")
+        Reason.other(
+            f"the fitted {part} is {median_mm:.1f} mm from its scan (median), which may be in another frame or of "
+            "another subject"
+        )
         for k, part in enumerate(model.parts)
         if (own := scan.parts == k).any() and (median_mm := float(np.median(distance_mm[own]))) > limit_mm
     ]

@@ -507,6 +507,8 @@ class ShapeModel:
             normal[free:, free:] += np.diag(precision)
             unit = 1.0 / np.sqrt(normal.diagonal())
             step = unit * np.linalg.solve(normal * np.outer(unit, unit), unit * pull)
+            if noise > 0.0:  # parts that are not seen turn freely, and large rotations are not linear
+                step /= max(1.0, float(np.abs(step[free:] / stddev).max()))
             if posed:
                 T = T @ small_similarity(np.pad(step[:free], (0, POSE - free)))
             b = b + step[free:]

@@ -199,12 +199,16 @@ def shape_posterior(
         problem, prior = _with_residual_modes(problem, extra)
         iterate = problem.iterate(Estimate(iterate.T_scan_model, np.pad(iterate.b, (0, len(extra.stddev)))))
         line = _LinearisedLikelihood.of(problem, matcher, iterate, hint, prior, beyond_mm2)
-        for _ in range(0 if settled else _LEVEL.iterations):
+        # A part that the scan lacks turns freely, which is not linear, so that steps to the optimum diverge.
+        lacks_part = target.shown is not None and not model.is_linear and not target.shown.all()
+        for _ in range(0 if settled or lacks_part else _LEVEL.iterations):
             before = iterate.T_scan_model.apply(iterate.surface.vertices)
             iterate = problem.iterate(iterate.estimate.moved_by(line.data.mean(line.variance) - line.theta))
             moved_mm = float(np.abs(iterate.T_scan_model.apply(iterate.surface.vertices) - before).max())
             if moved_mm < _SETTLED * size_mm * T_scan_model.scale:
                 break
+            if moved_mm > size_mm * T_scan_model.scale and not model.is_linear:
+                raise LinAlgError("The steps diverge, as a part turns freely.")
             line = _LinearisedLikelihood.of(problem, matcher, iterate, line.weighted.matches.hint, prior, beyond_mm2)
         mean, left_out = line.data.mean(line.variance), None
         covariance = line.data.covariance(line.variance)
@@ -213,7 +217,8 @@ def shape_posterior(
             covariance = left_out.covariance()
     except LinAlgError as error:
         raise FitError(
-            f"{target.mesh.name}: the scanned part does not determine the pose; give landmarks (--landmarks)."
+            f"{target.mesh.name}: what the scan shows does not determine the pose; give landmarks (--landmarks), or, "
+            "of several parts, all or one."
         ) from error
     # A settled posterior is part of each fit of a partial scan, which does not use the mismatches.
     mismatch_mm, covered_mismatch_mm = np.nan, np.nan
@@ -405,8 +410,9 @@ def predictive_covariance(errors: FloatArray) -> FloatArray:
 
 def root_of(covariance: FloatArray) -> FloatArray:
     """Return a root R (P, P) of a covariance, R R^T; it is scaled, as angles and coefficients differ in size."""
-    unit = np.sqrt(np.maximum(covariance.diagonal(), 1e-300))
-    value, vector = np.linalg.eigh(covariance / np.outer(unit, unit))
+    is_positive = covariance.diagonal() > 0.0  # rounding makes variances of fixed parameters negative
+    unit = np.sqrt(np.where(is_positive, covariance.diagonal(), 1.0))
+    value, vector = np.linalg.eigh(covariance * np.outer(is_positive, is_positive) / np.outer(unit, unit))
     return unit[:, None] * vector * np.sqrt(np.maximum(value, 0.0))
 
 

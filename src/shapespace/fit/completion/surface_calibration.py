@@ -144,7 +144,7 @@ def missing_error_mm(
     some = np.random.default_rng(0).choice(missing, min(len(missing), _SAMPLED), replace=False)
     rows = posterior.rows()[some]
     errors = (rows.reshape(-1, rows.shape[2]) @ left.errors.T.astype(np.float32)).reshape(len(some), 3, -1)
-    noise = np.einsum("vip,pq,viq->v", rows, left.noise.astype(np.float32), rows, optimize=True)
+    noise = np.maximum(np.einsum("vip,pq,viq->v", rows, left.noise.astype(np.float32), rows, optimize=True), 0.0)
     # The errors are those of the posterior mean, from which the fit differs.
     step = ((rows @ posterior.step.astype(np.float32)) ** 2).sum(axis=1)
     return float(np.sqrt((errors**2).sum(axis=1) + (noise + step)[:, None]).mean()) * T_scan_model.scale

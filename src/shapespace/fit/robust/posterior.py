@@ -25,8 +25,9 @@ from shapespace.model.new_shapes import variances_of_new_shapes, whole_spectrum
 from shapespace.model.shape_model import ShapeModel
 from shapespace.types import FloatArray, Similarity, SurfaceLandmarks
 
-_DAMPING = 1e-7
-"""Added to the unit diagonal of R15a; far below the precision of the float32 rows."""
+_DAMPING = (1e-7, 1e-5, 1e-3)
+"""Added to the unit diagonal of R15a, one after the other until the equations have a solution; the first is far below
+the precision of the float32 rows, and the others are for parts that the scan does not show, which turn freely."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,10 +105,13 @@ class NormalEquations:
         diagonal += self.D[free]
         unit = 1.0 / np.sqrt(np.maximum(diagonal, 1e-30))  # R15a
         hessian *= unit[:, None] * unit
-        diagonal += _DAMPING
-        # LAPACK itself: the checks of `cho_factor` take as long as its work.
-        factor, not_definite = dpotrf(hessian, lower=1, overwrite_a=1, clean=0)
-        if not_definite:
+        for damping in _DAMPING:
+            diagonal += damping
+            # LAPACK itself: the checks of `cho_factor` take as long as its work.
+            factor, not_definite = dpotrf(hessian, lower=1, overwrite_a=0, clean=0)
+            if not not_definite:
+                break
+        else:
             raise LinAlgError("The normal equations are not positive definite.")
         delta = np.zeros(len(self.gradient))
         delta[free] = -unit * dpotrs(factor, unit * self.gradient[free], lower=1)[0]  # R15

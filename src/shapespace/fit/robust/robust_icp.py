@@ -359,7 +359,9 @@ def robust_icp(
     """
     scale = start.T_scan_model.scale
     problem = Problem.of(prepare(model), target, settings, scale, with_scale=with_scale, marks=start.marks)
-    iterate = problem.iterate(Estimate(start.T_scan_model, np.zeros(model.n_modes)))
+    # The pose of all parts together depends on their relative poses.
+    b = start.b if start.how == "parts" else np.zeros(model.n_modes)
+    iterate = problem.iterate(Estimate(start.T_scan_model, b))
     matcher = problem.matcher(settings.levels[0])
     first = problem.match(
         matcher, iterate, matcher.first_hint(iterate.surface, iterate.T_scan_model, problem.prepared.tree)
