@@ -263,15 +263,20 @@ def joined(bones: dict[str, Mesh]) -> Mesh:
     return Mesh(np.concatenate([bone.vertices for bone in bones.values()]), np.concatenate(faces).astype(np.int32))
 
 
-def fits_with_given_and_found_parts(limbs: Limbs, count: int, seed: int, vertices: int) -> dict[str, object]:
-    """Return the share of points that are given to their bone, and the errors of both fits, mm."""
+def coarse_limbs(limbs: Limbs, vertices: int) -> tuple[dict[str, int], Callable[[dict[str, Mesh]], Mesh]]:
+    """Return the numbers of vertices of coarse bones, and the function that makes them of the bones of a limb."""
     thin = {bone: thinned(mesh, vertices) for bone, mesh in limbs.means.items()}
 
     def coarse(bones: dict[str, Mesh]) -> Mesh:
         return joined({bone: Mesh(mesh.vertices[thin[bone][0]], thin[bone][1]) for bone, mesh in bones.items()})
 
+    return {bone: len(own[0]) for bone, own in thin.items()}, coarse
+
+
+def fits_with_given_and_found_parts(limbs: Limbs, count: int, seed: int, vertices: int) -> dict[str, object]:
+    """Return the share of points that are given to their bone, and the errors of both fits, mm."""
+    counts, coarse = coarse_limbs(limbs, vertices)
     training = [coarse(limbs.draw(np.random.default_rng([seed, 1, k]))) for k in range(TRAINING)]
-    counts = {bone: len(own[0]) for bone, own in thin.items()}
     model = build_model(training, BuildConfig(parts=counts, gauge="form"))
     rows: list[dict[str, object]] = []
     for k in range(count):
@@ -318,11 +323,12 @@ def fits_with_given_and_found_parts(limbs: Limbs, count: int, seed: int, vertice
     }  # fmt: skip
 
 
-def stacked_and_jointed(limbs: Limbs, seeds: int, numbers: Sequence[int]) -> list[dict[str, float]]:
+def stacked_and_jointed(limbs: Limbs, vertices: int, seeds: int, numbers: Sequence[int]) -> list[dict[str, float]]:
     """Return the errors of limbs that are not in a model of shape and pose, and in one of stacked vertices.
 
     Args:
         limbs: limbs, `TRAINING` for each model and `HELD` for its error.
+        vertices: number of vertices of each bone.
         seeds: number of collections.
         numbers: numbers of modes.
 
@@ -330,11 +336,10 @@ def stacked_and_jointed(limbs: Limbs, seeds: int, numbers: Sequence[int]) -> lis
         For each number of modes the mean RMS distance of vertices, mm, of both models, and their ratio.
     """
     errors: dict[str, list[list[float]]] = {"kept": [], "modelled": []}
-    parts = {bone: len(mean.vertices) for bone, mean in limbs.means.items()}
+    parts, coarse = coarse_limbs(limbs, vertices)
     for seed in range(seeds):
         rng = np.random.default_rng([seed, 3])
-        drawn = [np.concatenate([bone.vertices for bone in limbs.draw(rng).values()]) for _ in range(TRAINING + HELD)]
-        meshes = [Mesh(vertices, name=f"limb{k:02d}") for k, vertices in enumerate(drawn)]
+        meshes = [replace(coarse(limbs.draw(rng)), name=f"limb{k:02d}") for k in range(TRAINING + HELD)]
         for pose, found in errors.items():
             model = build_model(
                 meshes[:TRAINING], BuildConfig(parts=parts, relative_pose=cast(RelativePose, pose), gauge="form")
@@ -343,7 +348,7 @@ def stacked_and_jointed(limbs: Limbs, seeds: int, numbers: Sequence[int]) -> lis
             for number in numbers:
                 own = model.truncate(number)
                 made = [own.reconstruct(own.project(mesh)).reshape(-1, 3) for mesh in meshes[TRAINING:]]
-                found[-1].append(float(np.mean([_rms(*pair) for pair in zip(made, drawn[TRAINING:], strict=True)])))
+                found[-1].append(float(np.mean([_rms(*pair) for pair in zip(made, meshes[TRAINING:], strict=True)])))
     means = {pose: np.mean(found, axis=0) for pose, found in errors.items()}
     return [
         {"modes": number, "stacked_mm": a, "jointed_mm": b, "ratio": b / a}
@@ -351,8 +356,8 @@ def stacked_and_jointed(limbs: Limbs, seeds: int, numbers: Sequence[int]) -> lis
     ]
 
 
-def _rms(vertices: FloatArray, truth: FloatArray) -> float:
-    off = fit_similarity(vertices, truth, with_scale=False).apply(vertices) - truth
+def _rms(vertices: FloatArray, truth: Mesh) -> float:
+    off = fit_similarity(vertices, truth.vertices, with_scale=False).apply(vertices) - truth.vertices
     return float(np.sqrt((off**2).sum(axis=1).mean()))
 
 
@@ -370,7 +375,7 @@ def main() -> None:
     limbs, start = Limbs(), time.perf_counter()
     others: dict[str, Callable[[], object]] = {
         "fits": lambda: fits_with_given_and_found_parts(limbs, asked.limbs, asked.seed, asked.vertices // 3),
-        "models": lambda: stacked_and_jointed(limbs, 5, (3, 5, 8, 11, 15)),
+        "models": lambda: stacked_and_jointed(limbs, asked.vertices // 5, 5, (3, 5, 8, 11, 15)),
         "unusual": lambda: unusual_poses(limbs, asked.limbs, asked.seed),
     }
     if asked.what in others:
