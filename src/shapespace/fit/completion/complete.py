@@ -351,7 +351,7 @@ def complete(
     if config.fit.region is not None and config.fit.region not in model.parts:
         of_parts = f"one of the parts {', '.join(model.parts)}" if model.parts else "no region"
         raise InputError(f"A completion needs a fit of the complete model, or of a part; give {of_parts}.")
-    fit = fit_scan(model, scan, config.fit, landmarks=landmarks, T_scan_model=T_scan_model)
+    fit = fit_scan(model, cast("MeshLike", scan), config.fit, landmarks=landmarks, T_scan_model=T_scan_model)
     model = model.with_all_modes
     if config.part is not None:
         fit = fit_scan(
