@@ -590,7 +590,7 @@ def _start_from_parts(
         # A part that looks alike from both ends, or is in another frame; the joint fit decides.
         if max(turn / joint.rotation_deg, shift / joint.translation_mm) > _UNLIKELY and joint.parent in sure:
             vertices[model.regions[joint.part]] = np.nan
-    error_mm = max(fits[part].evidence.expected_error_mm for part in sure) / scale
+    error_mm = max(e.expected_error_mm for part in sure if (e := fits[part].evidence) is not None) / scale
     b, T = model.nearest_in_any_pose(vertices, with_scale=with_scale, noise=error_mm**2 / 3.0)
     is_complete = not any(np.isnan(vertices[model.regions[part]]).any() for part in scans)
     return Start(T, "parts", float("nan"), b if is_complete else np.zeros(len(b)))  # the mean pose is nearer then

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, cast
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -344,13 +344,14 @@ def complete(
         raise InputError(
             f"The model was built from {model.n_training} shapes; a completion needs one of at least {_FEWEST_SHAPES}."
         )
-    if isinstance(scan, Mapping) and len(scan) == 1:
-        config = replace(config, fit=config.fit.for_scan(model, f"_{next(iter(scan))}"))
+    parts = list(cast("Mapping[str, MeshLike]", scan)) if isinstance(scan, Mapping) else []
+    if len(parts) == 1:
+        config = replace(config, fit=config.fit.for_scan(model, f"_{parts[0]}"))
     landmarks = read_landmarks(Path(landmarks)) if isinstance(landmarks, str | PathLike) else landmarks
     if config.fit.region is not None and config.fit.region not in model.parts:
         of_parts = f"one of the parts {', '.join(model.parts)}" if model.parts else "no region"
         raise InputError(f"A completion needs a fit of the complete model, or of a part; give {of_parts}.")
-    fit = fit_scan(model, scan, config.fit, landmarks=landmarks, T_scan_model=T_scan_model)
+    fit = fit_scan(model, cast("MeshLike", scan), config.fit, landmarks=landmarks, T_scan_model=T_scan_model)
     model = model.with_all_modes
     if config.part is not None:
         fit = fit_scan(

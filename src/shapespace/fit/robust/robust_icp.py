@@ -240,7 +240,7 @@ class Problem:
         parts = self.prepared.model.vertices_of_parts
         for _, _, vertex, corners, near in find_overlaps(Mesh(surface.vertices, surface.topology.faces), parts):
             outwards = (near.points - surface.vertices[vertex]) / np.maximum(near.distance, _TOUCH)[:, None]
-            moved = modes[vertex] - np.einsum("mc,mcdk->mdk", near.barycentric, modes[corners])
+            moved = modes[vertex] - np.einsum("mc,mcdk->mdk", np.asarray(near.barycentric), modes[corners])
             rows = np.einsum("md,mdk->mk", outwards, moved)
             H[POSE:, POSE:] += _STIFF * rows.T @ rows
             gradient[POSE:] -= _STIFF * rows.T @ near.distance
