@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 import shapespace as ss
 from shapespace.cli import main
 from shapespace.errors import FitError, InputError
+from shapespace.fit.diagnostics.reasons import ReasonCode
 from shapespace.fit.fit_scan import join_scans
 from shapespace.fit.scan_target import ScanTarget
 from shapespace.geometry.contact import find_penetrations
@@ -142,6 +143,17 @@ def test_scans_of_known_parts_have_one_fit_in_which_each_point_belongs_to_its_pa
     piece = part_of(scans["lower"], np.linalg.norm(apart, axis=1) > np.median(np.linalg.norm(apart, axis=1)))
     partial = ss.fit_scan(model, {"upper": scans["upper"], "lower": piece})
     assert np.linalg.norm(partial.surface().vertices - subject.vertices, axis=1).mean() < 1.0
+
+
+def test_a_completion_is_doubtful_if_a_small_piece_of_a_part_determines_its_pose(model) -> None:
+    subject = make_subjects(1, seed=5)[0]
+    scans = scans_of(subject)
+    along = np.linalg.norm(scans["lower"].vertices - subject.vertices[:162].mean(axis=0), axis=1)
+    for share, is_doubtful in ((0.2, True), (0.6, False)):
+        piece = part_of(scans["lower"], along < np.quantile(along, share))
+        found = ss.complete(model, {"upper": scans["upper"], "lower": piece}, ss.CompletionConfig(with_doubtful=True))
+        codes = {reason.code for reason in found.reasons}
+        assert (ReasonCode.PART_HARDLY_SEEN in codes) == is_doubtful and (found.status == "doubtful") >= is_doubtful
 
 
 def test_points_of_one_part_never_match_another_part_even_inside_it(model) -> None:

@@ -23,7 +23,7 @@ _BLOCK = 16
 NOTED = 2
 """Number of nearest points that `follow_into` stores for a query, and checks before it searches again."""
 STACK_SIZE = 128
-"""Length of the float64 workspace that `nearest_one` and `nearest_few` need."""
+"""Length of the float64 workspace that `nearest_few` needs."""
 
 
 class KdArrays(NamedTuple):
@@ -314,67 +314,6 @@ def start_at(
 
 
 @compiled
-def nearest_one(tree: KdArrays, x: float, y: float, z: float, guess: int, stack: FloatArray) -> tuple[int, float]:
-    """Return the index of the point nearest to (x, y, z) and its squared distance.
-
-    Args:
-        tree: arrays of the tree of points.
-        x: x coordinate of the query, in the unit of the points.
-        y: y coordinate of the query.
-        z: z coordinate of the query.
-        guess: index of a point that may be near, or -1.
-        stack: (STACK_SIZE,) float64 workspace, one per thread.
-    """
-    points, index, boxes, depth = tree.points, tree.original, tree.boxes, tree.depth
-    count, first_leaf = len(index), (1 << depth) - 1
-    best, squared = -1, np.inf
-    node, top = 0, 0
-    if guess >= 0:
-        row = tree.row_of[guess]
-        dx, dy, dz = points[row, 0] - x, points[row, 1] - y, points[row, 2] - z
-        best, squared = guess, dx * dx + dy * dy + dz * dz
-        node, top = start_at(boxes, row, count, depth, x, y, z, squared, stack)
-    while True:
-        while node < first_leaf:
-            left = 2 * node + 1
-            near, far = box_distance(boxes, left, x, y, z), box_distance(boxes, left + 1, x, y, z)
-            node = left
-            if far < near:
-                node = left + 1
-                near, far = far, near
-            if near > squared:
-                node = -1
-                break
-            if far <= squared:
-                stack[top], stack[top + 1] = 2 * left + 1 - node, far
-                top += 2
-        if node >= 0:
-            leaf = node - first_leaf
-            for row in range((leaf * count) >> depth, ((leaf + 1) * count) >> depth):
-                dx, dy, dz = points[row, 0] - x, points[row, 1] - y, points[row, 2] - z
-                d = dx * dx + dy * dy + dz * dz
-                if d < squared or (d == squared and (best < 0 or index[row] < best)):
-                    best, squared = index[row], d
-        while top > 0 and stack[top - 1] > squared:
-            top -= 2
-        if top == 0:
-            return best, squared
-        top -= 2
-        node = int(stack[top])
-
-
-@compiled
-def nearest_into(
-    tree: KdArrays, queries: FloatArray, guess: IntArray, index_out: IntArray, squared_out: FloatArray
-) -> None:
-    """Write index (M,) and squared distance (M,) of the points nearest to `queries` (M, 3) given `guess` (M,)."""
-    stack = np.empty(STACK_SIZE)
-    for i in range(len(queries)):
-        nearest, squared = nearest_one(tree, queries[i, 0], queries[i, 1], queries[i, 2], guess[i], stack)
-        index_out[i], squared_out[i] = nearest, squared
-
-
-@compiled
 def nearest_few(
     tree: KdArrays,
     x: float,
@@ -443,6 +382,23 @@ def nearest_few(
             return
         top -= 2
         node = int(stack[top])
+
+
+@compiled
+def nearest_into(
+    tree: KdArrays, queries: FloatArray, guess: IntArray, index_out: IntArray, squared_out: FloatArray
+) -> None:
+    """Write index (M,) and squared distance (M,) of the points nearest to `queries` (M, 3) given `guess` (M,)."""
+    points, stack, rows, squared = tree.points, np.empty(STACK_SIZE), np.empty(1, dtype=np.int32), np.empty(1)
+    for i in range(len(queries)):
+        x, y, z = queries[i, 0], queries[i, 1], queries[i, 2]
+        row, limit = -1, np.inf
+        if guess[i] >= 0:
+            row = tree.row_of[guess[i]]
+            dx, dy, dz = points[row, 0] - x, points[row, 1] - y, points[row, 2] - z
+            limit = dx * dx + dy * dy + dz * dz
+        nearest_few(tree, x, y, z, limit, row, rows, squared, stack)
+        index_out[i], squared_out[i] = tree.original[rows[0]], squared[0]
 
 
 @compiled

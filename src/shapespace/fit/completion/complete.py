@@ -67,6 +67,9 @@ _MOST_OFF_MODEL = 4.0
 """Off-model standard deviation of a scan, in units of the predicted one, of models without training shapes: 10 real
 femora reach 1.5, 130 of 132 other objects at least 4.6, and the others are doubtful for other reasons (open femur
 model, `benchmarks/self_calibration.py wrong`)."""
+_LEAST_OF_PART = 1 / 3
+"""Share of a part with a modelled relative pose that determines the pose: half of a tibia did in 8 of 8 limbs, and a
+fifth in 5 of 6 (docs/structures.md)."""
 _LEAST_AREA, _REVERTS = 0.1, 20  # share of its area that a triangle keeps on the scan, and rounds to enforce it
 _IMPLAUSIBLE, _RARE = 3.0, 1e-5
 """Mean square of the coefficients in standard deviations of new shapes (1.4 is the most measured, with 51 modes), and
@@ -397,7 +400,9 @@ def complete(
     if config.part is not None:
         observed[ModelRegion.of(model, config.part).inside] = False
     calibration = calibrate(posterior, model, ~observed)
-    status, reasons = _judge_completion(fit, posterior, calibration, dense.noise_mm, apart_mm, config)
+    seen = [] if model.is_linear else [float(observed[part].mean()) for part in model.vertices_of_parts.values()]
+    of_part = min((share for share in seen if share > 0.0), default=1.0)
+    status, reasons = _judge_completion(fit, posterior, calibration, dense.noise_mm, apart_mm, config, of_part)
     notes = [*fit.notes, *_describe_missing_parts(model, fit, observed, with_scale=with_scale)]
     if scan_mm.parts is not None and (pose := relative_pose(model)) is not None and pose.choice == "removed":
         notes.append(
@@ -519,6 +524,7 @@ def _judge_completion(
     noise_mm: float,
     apart_mm: float | None,
     config: CompletionConfig,
+    of_part: float = 1.0,
 ) -> tuple[Status, tuple[Reason, ...]]:
     """Return status and reasons: the doubts about the fit that no test replaces, then those of the tests.
 
@@ -530,6 +536,8 @@ def _judge_completion(
     doubts = [] if fit.status != "doubtful" else reasons
     if apart_mm is not None:
         doubts.append(Reason(ReasonCode.POSE_AMBIGUOUS, {"apart_mm": apart_mm}))
+    if of_part < _LEAST_OF_PART:
+        doubts.append(Reason(ReasonCode.PART_HARDLY_SEEN, {"seen_share": of_part}))
     modes = posterior.n_modes
     z2, limit = posterior.mean_square_z, max(_IMPLAUSIBLE, float(chdtri(modes, _RARE)) / modes)
     if z2 > limit:

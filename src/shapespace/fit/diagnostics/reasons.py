@@ -34,6 +34,7 @@ class ReasonCode(StrEnum):
     SCAN_LAYERED = "scan_layered"  # layers_apart_mm
     INSTANCES_OVERLAP = "instances_overlap"  # second_instance_mm
     POSE_AMBIGUOUS = "pose_ambiguous"  # apart_mm
+    PART_HARDLY_SEEN = "part_hardly_seen"  # seen_share
     PARTS_DISPLACED = "parts_displaced"  # displaced_share
     PARTS_UNEXPLAINED = "parts_unexplained"  # displaced_share
     POINTS_SCATTERED = "points_scattered"  # scattered_share
@@ -146,6 +147,9 @@ _TEXTS: Mapping[ReasonCode, Callable[[Mapping[str, Any]], str]] = MappingProxyTy
         ReasonCode.POSE_AMBIGUOUS: lambda d: (
             f"the scan fits the model in two poses about equally well, {d['apart_mm']:.0f} mm apart; give landmarks "
             "(--landmarks)"
+        ),
+        ReasonCode.PART_HARDLY_SEEN: lambda d: (
+            f"the scan shows {100 * d['seen_share']:.0f} % of one of its parts, which can fit in a wrong relative pose"
         ),
         ReasonCode.PARTS_DISPLACED: lambda d: (
             f"{100 * d['displaced_share']:.0f} % of the scan runs along the fitted surface at a distance from it, as "
