@@ -3,7 +3,7 @@ import pytest
 from scipy.spatial import Delaunay
 
 from shapespace.errors import MeshError
-from shapespace.geometry.flatten import disc_map
+from shapespace.geometry.flatten import cylinder_map, disc_map, folded_triangles
 from shapespace.geometry.normals import face_areas
 from shapespace.types import FloatArray, Mesh
 from synthetic_shapes import similarity, sphere
@@ -41,13 +41,6 @@ def cut(mesh: Mesh, holes: list[tuple[float, float, float]]) -> Mesh:
 def used(vertices: FloatArray, faces: np.ndarray) -> Mesh:
     index, faces = np.unique(faces, return_inverse=True)
     return Mesh(vertices[index], faces.reshape(-1, 3).astype(np.int32), name="surface")
-
-
-def folded_triangles(uv: FloatArray, faces: np.ndarray) -> np.ndarray:
-    """Return (F,) True for triangles that are turned the other way than most, or have no area."""
-    p, q = (uv[faces[:, k]] - uv[faces[:, 0]] for k in (1, 2))
-    turning = p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
-    return turning * np.sign(np.median(np.sign(turning))) <= 0
 
 
 def covered_twice(uv: FloatArray, faces: np.ndarray) -> int:
@@ -171,3 +164,19 @@ def test_a_band_is_a_disc_with_a_hole_and_one_triangle_is_a_disc() -> None:
     assert not folded_triangles(disc_map(band), band.faces).any()
     triangle = Mesh(np.array([[0, 0, 0], [1, 0, 0], [0, 1.0, 0]]), np.array([[0, 1, 2]]))
     assert disc_map(triangle).shape == (3, 2)
+
+
+def test_a_cylinder_is_unrolled_and_a_pocket_overlaps_on_it() -> None:
+    rng = np.random.default_rng(0)
+    angle, height = rng.uniform(-1.0, 1.0, 800), rng.uniform(0.0, 50.0, 800)
+    faces = Delaunay(np.column_stack([angle, height / 40])).simplices
+    x = np.column_stack([7 + 40 * np.sin(angle), height, 40 * np.cos(angle) - 3])
+    uv = cylinder_map(Mesh(x, faces.astype(np.int32)))
+    shares = np.column_stack([(angle - angle.min()) / np.ptp(angle), (height - height.min()) / np.ptp(height)])
+    assert min(np.abs(uv - shares).max(), np.abs(uv - np.column_stack([1 - shares[:, 0], shares[:, 1]])).max()) < 1e-9
+    assert not folded_triangles(uv, faces).any()
+    pushed = np.where((np.abs(angle) < 0.3) & (np.abs(height - 25) < 10), -0.5, 0.0)
+    folded = cylinder_map(
+        Mesh(x + np.column_stack([0 * angle, pushed * (25 - height) * -3, 0 * angle]), faces.astype(np.int32))
+    )
+    assert folded_triangles(folded, faces).any()

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from shapespace.errors import InputError
-from shapespace.recognise.line_structure import disjointness, line_scores
+from shapespace.recognise.line_structure import disjointness, line_scores, pooled_line_scores
 
 INTENSITY = np.array([0.25, 0.5, 0.75, 1.0])
 
@@ -97,6 +97,32 @@ def test_neutral_samples_have_no_line():
         line_scores(np.zeros((4, 3)), INTENSITY)
 
 
+def test_lines_of_the_paper_are_significant_each_and_shuffled_labels_are_not():
+    rng = np.random.default_rng(5)
+    v, labels = rays(rng, noise=0.1)
+    pooled = pooled_line_scores(v, labels, np.tile(INTENSITY, 4))
+    for c, name in enumerate(("anger", "disgust", "fear", "smile")):
+        alone = line_scores(v[4 * c : 4 * c + 4], INTENSITY)
+        assert pooled.r2_through_neutral[name] == pytest.approx(alone.r2_through_neutral)
+        assert pooled.r2_p[name] < 0.01
+    assert pooled.mean_r2_p == pooled.monotonicity_p == 0.001
+    assert pooled.spearman == pytest.approx(1.0)
+    wrong = pooled_line_scores(v, list(rng.permutation(labels)), rng.permutation(np.tile(INTENSITY, 4)))
+    assert min(wrong.mean_r2_p, wrong.monotonicity_p) > 0.02
+
+
+def test_without_intensities_there_is_no_monotonicity():
+    v, labels = rays(np.random.default_rng(6), noise=0.1)
+    pooled = pooled_line_scores(v, labels, permutations=9)
+    assert pooled.spearman is None and pooled.monotonicity_p is None
+
+
+def test_a_wrong_order_of_one_expression_is_seen_by_the_pooled_test_as_by_its_own():
+    v, labels = rays(np.random.default_rng(7))
+    turned = np.concatenate([INTENSITY[::-1], np.tile(INTENSITY, 3)])
+    assert pooled_line_scores(v, labels, turned).spearman == pytest.approx(0.5)
+
+
 def test_the_smallest_margin_is_the_gap_in_standard_deviations():
     # Two clouds whose within-class covariance is round: the discriminant is the line between their means.
     square = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
@@ -127,3 +153,13 @@ def test_samples_without_scatter_or_with_more_modes_than_samples_still_have_fini
     assert np.isfinite([scores.smallest_margin, scores.separability, scores.margin_p]).all()
     exact, labels = rays(np.random.default_rng(0))
     assert np.isfinite(disjointness(np.sign(exact), labels, permutations=5).smallest_margin)
+
+
+@pytest.mark.parametrize(
+    ("v", "labels"), [(np.ones((4, 3)), ["a"] * 4), (np.ones((4, 3)), ["a", "a", "a", "b"]), (np.eye(4), "aabb")]
+)
+def test_lines_that_cannot_be_compared_are_refused(v, labels):
+    v = v.copy()
+    v[:2] = 0.0
+    with pytest.raises(InputError):
+        pooled_line_scores(v, list(labels))

@@ -2,7 +2,8 @@
 
 `disc_map` is one-to-one for every surface that is a disc with or without holes (Tutte 1963; Floater, Math. Comp. 72,
 2003): its rim is on a convex curve, every other vertex is an average of its neighbours with positive weights, and each
-hole is closed by an additional vertex.
+hole is closed by an additional vertex. `cylinder_map` is a height field for comparison: it overlaps where a line from
+the axis meets the surface more than once.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy.typing as npt
 
 from shapespace.errors import MeshError
 from shapespace.geometry.normals import faces_of
-from shapespace.types import FloatArray, IntArray, Mesh
+from shapespace.types import BoolArray, FloatArray, IntArray, Mesh
 
 _ROUNDNESS = 4.0
 """Exponent of the rim |x|^p + |y|^p = 1: strictly convex, and 93 % of the square (a circle has 79 %)."""
@@ -70,6 +71,35 @@ def disc_map(mesh: Mesh, *, most_rounds: int = 40) -> FloatArray:
             "--representation vertices."
         )
     return np.ascontiguousarray(best[1][: len(mesh.vertices)])
+
+
+def cylinder_map(mesh: Mesh, axis: int = 1) -> FloatArray:
+    """Return angle about an axis and height along it, (V, 2), each scaled to [0, 1]; the map may not be one-to-one.
+
+    Args:
+        mesh: a mesh, with or without triangles.
+        axis: index of the axis of the frame, 0 to 2; the centre of the cylinder is that of the circle fitted to the
+            vertices in projection along the axis.
+    """
+    x = mesh.vertices[:, [(axis + 2) % 3, (axis + 1) % 3]] if axis == 1 else np.delete(mesh.vertices, axis, axis=1)
+    columns = np.column_stack([2 * x, np.ones(len(x))])
+    centre = np.asarray(np.linalg.lstsq(columns, (x**2).sum(axis=1), rcond=None)[0], dtype=np.float64)[:2]
+    around = x - centre
+    middle = around.mean(axis=0)
+    forward, side = around @ middle, around @ np.array([-middle[1], middle[0]])
+    uv = np.column_stack([np.arctan2(side, forward), mesh.vertices[:, axis]])
+    return (uv - uv.min(axis=0)) / np.ptp(uv, axis=0)
+
+
+def folded_triangles(uv: FloatArray, faces: IntArray) -> BoolArray:
+    """Return (F,) True for triangles whose orientation on the square is opposite to the majority, or without area.
+
+    Args:
+        uv: (V, 2) positions of the vertices on the square.
+        faces: (F, 3) triangles.
+    """
+    turning = _signed_areas(uv, faces)
+    return turning * np.sign(np.median(np.sign(turning))) <= 0
 
 
 def _signed_areas(uv: FloatArray, faces: IntArray) -> FloatArray:

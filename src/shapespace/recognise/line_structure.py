@@ -7,7 +7,7 @@ intensity are expected on a line through neutral, and different expressions on d
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,6 +36,27 @@ class LineScores:
     sign_consistency: float
     spearman: float
     permutation_p: float
+
+
+@dataclass(frozen=True)
+class PooledLineScores:
+    """Scores of the lines of all expressions together.
+
+    Args:
+        r2_through_neutral: expression -> share of the squares on its line, as in `LineScores`.
+        r2_p: expression -> share of shuffles of the labels in which as many samples lie on a line at least as well.
+        mean_r2_p: the same share for the mean over the expressions.
+        spearman: mean over the expressions of the rank correlation with intensity; None without intensities.
+        monotonicity_p: share of shuffles of the intensities within each expression that correlate at least as well on
+            average. Four levels of a single expression cannot have less than 1/24; those of several expressions can.
+            None without intensities.
+    """
+
+    r2_through_neutral: Mapping[str, float]
+    r2_p: Mapping[str, float]
+    mean_r2_p: float
+    spearman: float | None
+    monotonicity_p: float | None
 
 
 @dataclass(frozen=True)
@@ -98,6 +119,65 @@ def line_scores(v: FloatArray, intensity: FloatArray, *, permutations: int = 999
         spearman=rho,
         permutation_p=_permutation_p(rho, shuffled),
     )
+
+
+def pooled_line_scores(
+    v: FloatArray,
+    labels: Sequence[str],
+    intensity: FloatArray | None = None,
+    *,
+    permutations: int = 999,
+    seed: int = 0,
+) -> PooledLineScores:
+    """Test the lines of all expressions against shuffled labels, and their order against shuffled intensities.
+
+    Args:
+        v: (n, K) coefficients relative to neutral in standard deviations.
+        labels: n expression names, at least two names with at least two samples each.
+        intensity: (n,) intensity of each sample; None if not known.
+        permutations: number of permutations of the labels, and of the intensities.
+        seed: seed of the permutations.
+
+    Raises:
+        InputError: one expression only, one with a single sample, or an expression of neutral samples alone.
+    """
+    names, classes = np.unique(np.asarray(labels), return_inverse=True)
+    _check(v, classes.astype(np.float64) if intensity is None else intensity)
+    if len(names) < 2 or len(classes) != len(v) or np.bincount(classes).min() < 2:
+        raise InputError("The lines of expressions need at least two expressions with at least two samples each.")
+    if not all((v[classes == c] ** 2).sum() > 0 for c in range(len(names))):
+        raise InputError("All samples of one expression are neutral, so they have no line.")
+    gram = v @ v.T
+    observed = _line_r2(gram, classes)
+    rng = np.random.default_rng(seed)
+    shuffled = np.stack([_line_r2(gram, rng.permutation(classes)) for _ in range(permutations)])
+    rho = monotonicity_p = None
+    if intensity is not None:
+        groups = [classes == c for c in range(len(names))]
+        pairs = [(_ranks(_position(v[rows])), _ranks(intensity[rows])) for rows in groups]
+        rho = float(np.mean([_correlation(a, b) for a, b in pairs]))
+        drawn = [float(np.mean([_correlation(a, rng.permutation(b)) for a, b in pairs])) for _ in range(permutations)]
+        monotonicity_p = _permutation_p(rho, drawn)
+    class_names = [str(name) for name in names]
+    return PooledLineScores(
+        r2_through_neutral=dict(zip(class_names, observed.tolist(), strict=True)),
+        r2_p={name: _permutation_p(float(observed[c]), shuffled[:, c].tolist()) for c, name in enumerate(class_names)},
+        mean_r2_p=_permutation_p(float(observed.mean()), shuffled.mean(axis=1).tolist()),
+        spearman=rho,
+        monotonicity_p=monotonicity_p,
+    )
+
+
+def _line_r2(gram: FloatArray, classes: np.ndarray) -> FloatArray:
+    """Return R2 of the line through neutral of each class, from the inner products (n, n) of the samples."""
+    scores: list[float] = []
+    for c in range(int(classes.max()) + 1):
+        rows = np.flatnonzero(classes == c)
+        part = gram[np.ix_(rows, rows)]
+        energy = float(np.trace(part))
+        # The squared singular values of the samples are the eigenvalues of their products.
+        scores.append(float(np.linalg.eigvalsh(part)[-1]) / energy if energy > 0 else 0.0)
+    return np.asarray(scores)
 
 
 def disjointness(v: FloatArray, labels: Sequence[str], *, permutations: int = 999, seed: int = 0) -> DisjointnessScores:
