@@ -17,6 +17,7 @@ from typing import Any
 
 import httpx
 import pytest
+from msgspec.structs import replace
 from test_studio_project import tetrahedron
 from viewer_world import enter, sentence, served, unpacked
 
@@ -354,6 +355,16 @@ def test_independent_jobs_run_together_and_jobs_on_the_same_results_wait(tmp_pat
         wait_for(jobs, changed, "failed")  # it waited for the end of the job that writes its input
     finally:
         jobs.close()
+
+
+def test_a_long_job_that_has_just_let_go_of_its_folder_is_not_interrupted(tmp_path: Path) -> None:
+    jobs = Jobs(tmp_path, lambda: None)
+    jobs.close()
+    job = replace(jobs.get(command(jobs, "data", "bones", "-o", "out-1")), status="running")
+    jobs._started[job.number], jobs._alive[job.number] = time.time() - 100, time.time()
+    assert jobs._with_status(job).status == "running"
+    jobs._alive[job.number] -= 100
+    assert jobs._with_status(job).status == "interrupted"
 
 
 def test_no_more_jobs_run_than_cores_allow_and_they_start_in_order(tmp_path: Path) -> None:

@@ -394,7 +394,7 @@ def nearest_into(
         x, y, z = queries[i, 0], queries[i, 1], queries[i, 2]
         row, limit = -1, np.inf
         if guess[i] >= 0:
-            row = tree.row_of[guess[i]]
+            row = int(tree.row_of[guess[i]])
             dx, dy, dz = points[row, 0] - x, points[row, 1] - y, points[row, 2] - z
             limit = dx * dx + dy * dy + dz * dz
         nearest_few(tree, x, y, z, limit, row, rows, squared, stack)

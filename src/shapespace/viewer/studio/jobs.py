@@ -26,7 +26,7 @@ FOLDER = "jobs"
 TAKEN = "taken"
 """File in the folder of a job whose result was taken into the project, with sentences on parts that were not."""
 _POLL_S = 0.3  # between looks at the running job
-_START_S = 30.0  # after which a process that does not lock its folder has failed to start
+_START_S = 30.0  # after which a process that does not lock its folder, and has not ended, is gone
 _LOG_END = 4000  # bytes of the log in which the last message is searched
 _ENDED: tuple[Status, ...] = ("done", "failed", "cancelled", "interrupted")
 _OF_PROJECT = ("inputs/", "scans/", "surfaces/", "groomed/")
@@ -140,6 +140,7 @@ class Jobs:
         self._lock = threading.RLock()
         self._jobs: dict[int, Job] = {}
         self._started: dict[int, float] = {}
+        self._alive: dict[int, float] = {}
         self._seen_progress: dict[int, int] = {}
         self._stop = threading.Event()
         for path in sorted(self._folder.glob(f"*/{JOB}")):
@@ -281,7 +282,7 @@ class Jobs:
                         active.append(job)  # later jobs do not overtake it if it waits
 
     def _start(self, job: Job) -> None:
-        self._started[job.number] = time.time()
+        self._started[job.number] = self._alive[job.number] = time.time()
         try:
             start(self.folder_of(job))
         except OSError as error:
@@ -330,8 +331,9 @@ class Jobs:
             return replace(job, status=status, code=code, seconds=seconds, message=self._last_line(folder))
         if is_running(folder):
             self._started.setdefault(job.number, _modified_s(folder / JOB))
+            self._alive[job.number] = time.time()
             return replace(job, status="running")
-        if job.status == "running" and time.time() - self._started.get(job.number, 0.0) < _START_S:
+        if job.status == "running" and time.time() - self._alive.get(job.number, 0.0) < _START_S:
             # Its process is about to lock the folder, or has let go of it and is about to write how it ended.
             return job
         has_begun = job.status == "running" or (folder / LOG).exists()
