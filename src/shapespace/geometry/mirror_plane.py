@@ -302,7 +302,8 @@ def solve_sides(scores: FloatArray, anchors: Sequence[int], seed: int) -> ScanSi
         if i >= 0:
             evidence[a, i] = 0.0  # a scan agrees with itself whatever its side
     asymmetry = float(np.median(np.abs(evidence[evidence != 0]))) if evidence.any() else 0.0
-    signs, agreement = (found[0] for found in _best_signs(evidence[None], anchors))
+    best, most = _best_signs(evidence[None], anchors)
+    signs, agreement = best[0], float(most[0])
     rng, drawn = np.random.default_rng(seed), list[float]()
     for _ in range(0, _DRAWS, _DRAWN_AT_ONCE):
         flipped = evidence * rng.choice([-1.0, 1.0], (_DRAWN_AT_ONCE, *evidence.shape))
