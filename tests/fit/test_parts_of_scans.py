@@ -138,7 +138,7 @@ def test_scans_of_known_parts_have_one_fit_in_which_each_point_belongs_to_its_pa
     assert np.linalg.norm(fit.surface().vertices - subject.vertices, axis=1).mean() < 0.1
     assert np.array_equal(fit.scan_parts(), np.repeat([0, 1], 162))
     assert fit.overlap_distances.model_seen_share == 1.0
-    # The end of the upper bone beside a lower bone without its own: no point of it belongs to the lower bone.
+    # The scan of the lower bone lacks its end at the joint; points of the upper bone there must not belong to it.
     apart = scans["lower"].vertices - subject.vertices[:162].mean(axis=0)
     piece = part_of(scans["lower"], np.linalg.norm(apart, axis=1) > np.median(np.linalg.norm(apart, axis=1)))
     partial = ss.fit_scan(model, {"upper": scans["upper"], "lower": piece})

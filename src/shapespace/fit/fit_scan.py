@@ -222,9 +222,9 @@ class FitConfig:
         # Not `asdict` of all fields: a method given by name has settings too.
         common = {name: getattr(self, name) for name in ("modes", "unit", "scale", "max_iterations", "seed", "dense")}
         method = self.fitting
-        stddev = self.landmark_stddev_mm
         optional = {
-            "landmark_stddev_mm": "inf" if stddev == np.inf else stddev,  # JSON has no infinity
+            # JSON has no infinity.
+            "landmark_stddev_mm": "inf" if self.landmark_stddev_mm == np.inf else self.landmark_stddev_mm,
             "crop": self.crop,
             "region": self.region
             if self.region is None or isinstance(self.region, str)
@@ -295,11 +295,8 @@ def fit_scan(
         limits = config.limits(model)
         if held is not None:
             limits = replace(limits, modes=None, part=True)
-        states, history, phase_2_from = (
-            config.fitting.states(own, placed.target, placed.start, limits),
-            list[IcpState](),
-            clock[-1],
-        )
+        states = config.fitting.states(own, placed.target, placed.start, limits)
+        history, phase_2_from = list[IcpState](), clock[-1]
         try:
             while True:
                 state = next(states)

@@ -99,7 +99,7 @@
       this._moved();
     }
 
-    /** Put target and extent of the camera on what is visible; return whether anything is visible. */
+    /** Centre the camera on the visible objects and fit its extent to them; return whether an object is visible. */
     _enclose(ids, margin, turned) {
       if (!this.works) return false;
       const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
